@@ -129,10 +129,9 @@ def validate_on_workers(arguments: argparse.Namespace, loaded: LoadedScene, dept
         return
     from mivol.cluster.packages import SceneSource, share_scene
     from mivol.cluster.reference import complete_on, passes_on
-    from mivol.scene.explain import read_settings
+    from mivol.scene.explain import describe_light
 
-    depth = read_settings(loaded.scene).max_depth if depth is None else depth
-    integrator = {"type": "mivol", "max_depth": depth}
+    integrator = {"type": "mivol", **describe_light(loaded.scene, depth)}
     with open_workers(arguments.cluster, arguments.mode, arguments.threads) as pool, status_line() as show:
         scene = share_scene(pool, scene_source(arguments, SceneSource), loaded)
         passes = passes_on(pool, scene, arguments.sensor, integrator, show)

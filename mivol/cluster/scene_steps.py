@@ -95,7 +95,7 @@ def make_scene_twin(place: Workplace, content: dict[str, Any]) -> SceneTwin:
         for name, look, image in zip(content["names"], looks, content["references"], strict=True)
     ]
     options = {"spp": settings.fit.spp, "samples_per_pass": settings.fit.samples_per_pass, "seed": settings.seed}
-    problem = SceneProblem(scene, views, content["parameters"], make_integrator(settings), settings.loss, **options)
+    problem = SceneProblem(scene, views, content["parameters"], make_integrator(settings, scene), settings.loss, **options)
     problem.batches = make_blocks(views, problem.spp)
     return SceneTwin(problem)
 

@@ -100,7 +100,9 @@ class SceneFitSettings(Section):
     spp: Annotated[int, setting("sample/pixel", "samples of an image and of its derivative", ge=1)] = 16
     spp_shown: Annotated[int, setting("sample/pixel", "of report images, 16 or more for z-images; 0: spp", ge=0)] = 0
     samples_per_pass: Annotated[int, setting("sample", "most samples in one kernel; Ctrl-C waits for it", ge=1)] = 1 << 20
-    max_depth: Annotated[Depth | str, setting("1", "longest path, as in volpath; -1: unlimited; auto: measured")] = 6
+    max_depth: Annotated[
+        Depth | str | None, setting("1", "longest path, as in volpath; -1: unlimited; auto: measured; absent: the scene's")
+    ] = None
     noise: Annotated[float, setting("1", "noise over mean radiance; max_depth = auto neglects less", gt=0)] = 0.02
     integrator: Annotated[str, setting("1", "Mitsuba integrator with derivatives", min_length=1)] = "mivol"
 

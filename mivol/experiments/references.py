@@ -22,6 +22,7 @@ from mivol.files.fetch import PREFIX, resolve_path
 from mivol.machine import check_memory
 from mivol.optim.parameters import find, like
 from mivol.optim.scenes.views import View, check_sizes
+from mivol.scene.explain import describe_light
 from mivol.scene.load import LoadedScene, load_scene
 from mivol.scene.sensors import check_film
 from mivol.scene_graph import traverse
@@ -155,8 +156,8 @@ def render_views(
     cache.mkdir(exist_ok=True)
     depth = settings.fit.max_depth if reference_settings.max_depth is None else reference_settings.max_depth
     options = {
-        "max_depth": depth, "target_se": reference_settings.standard_error or None, "max_spp": reference_settings.spp,
-        "seed": reference_settings.seed,
+        **describe_light(loaded.scene, depth), "target_se": reference_settings.standard_error or None,
+        "max_spp": reference_settings.spp, "seed": reference_settings.seed,
     }  # fmt: skip
     prepared = (prepare_reference(loaded, cache, sensor=sensor, **options) for sensor in sensors)
     renders = (reference.complete() for reference in prepared) if complete is None else complete(prepared)

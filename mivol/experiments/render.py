@@ -36,7 +36,7 @@ from mivol.points.conversions import points_to_gaussians
 from mivol.points.gaussian_files import is_gaussian_file, read_gaussian_view, read_gaussians
 from mivol.points.gaussians import Gaussians
 from mivol.scene.description import describe_error
-from mivol.scene.explain import read_settings
+from mivol.scene.explain import describe_light
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.splatting import Splatter, to_tensors
 
@@ -64,7 +64,7 @@ def integrator_name(integrator: mi.Integrator) -> str:
 
 
 def choose_integrator(scene: mi.Scene, name: str | None = None) -> mi.Integrator:
-    """Return the scene's integrator, or the named integrator, with the same ``max_depth`` if supported.
+    """Return the scene's integrator, or the named integrator with the same ``hide_emitters`` and, if it has one, ``max_depth``.
 
     Raises:
         MivolError: no integrator in the scene and no name, or an unknown name.
@@ -74,7 +74,7 @@ def choose_integrator(scene: mi.Scene, name: str | None = None) -> mi.Integrator
             raise MivolError("the scene has no integrator: add an integrator to the scene, or choose --integrator mivol.")
         return scene.integrator()
     try:
-        return mi.load_dict({"type": name, "max_depth": read_settings(scene).max_depth})
+        return mi.load_dict({"type": name, **describe_light(scene)})
     except RuntimeError as error:
         if "max_depth" in str(error):
             return mi.load_dict({"type": name})

@@ -56,7 +56,7 @@ from mivol.optim.scenes.views import FINAL, HELD_OUT, RenderBatch, View, derive_
 from mivol.report.cameras import draw_view_cameras
 from mivol.report.pixel_scale import is_preview_due
 from mivol.report.record import Image, PlanLine, Volume
-from mivol.scene.explain import Explanation, explain_scene
+from mivol.scene.explain import Explanation, describe_light, explain_scene, read_settings
 from mivol.scene.load import LoadedScene
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import Plan, make_plan
@@ -118,7 +118,7 @@ class SceneFit(FitKind):
         for start in self.starts:
             say(f"  parameter {describe_start(start)}")
         check_truth(self.settings)
-        self.integrator = make_integrator(self.settings)
+        self.integrator = make_integrator(self.settings, self.loaded.scene)
 
     def render_data(self, run: RunFolder) -> None:
         with run.stage("references"):
@@ -224,17 +224,19 @@ class SceneFit(FitKind):
 def resolve_depth(
     settings: SceneExperiment, loaded: LoadedScene, truth: np.ndarray | None
 ) -> tuple[SceneExperiment, list[PlanLine]]:
-    """Put a number in place of ``max_depth = "auto"``.
+    """Put a number in place of ``max_depth = "auto"`` or of an absent ``max_depth``.
 
-    The depth is measured from the first view, in the scene that renders the references. If the references are files and the
-    truth is unknown, nothing can be measured, and paths have no limit.
+    An absent depth is the depth of the scene's integrator. ``auto`` is measured from the first view, in the scene that renders
+    the references. If the references are files and the truth is unknown, nothing can be measured, and paths have no limit.
 
     Returns:
         Settings with a number, and the reason; unchanged settings if ``max_depth`` is a number.
     """
-    if settings.fit.max_depth != AUTO:
+    if settings.fit.max_depth is None:
+        depth, reason = read_settings(loaded.scene).max_depth, "the scene's integrator has it"
+    elif settings.fit.max_depth != AUTO:
         return settings, []
-    if truth is None and not isinstance(settings.reference, Rendered):
+    elif truth is None and not isinstance(settings.reference, Rendered):
         depth, reason = -1, "the references are files of an unknown volume"
     else:
         with nullcontext() if truth is None else hold_values(loaded.scene, settings.truth.key, truth):
@@ -253,15 +255,15 @@ def describe_start(start: Start) -> str:
     return f"{start.parameter.name}: {shape}, in [{low:g}, {high:g}] {start.parameter.unit}, from {mean:.4g}"
 
 
-def make_integrator(settings: SceneExperiment) -> mi.Integrator:
-    """Load the integrator of the fit.
+def make_integrator(settings: SceneExperiment, scene: mi.Scene) -> mi.Integrator:
+    """Load the integrator of the fit, which hides emitters where the scene's integrator does.
 
     Raises:
         MivolError: an unknown integrator, or settings refused by the integrator.
     """
     name = settings.fit.integrator
     try:
-        return mi.load_dict({"type": name, "max_depth": settings.fit.max_depth})
+        return mi.load_dict({"type": name, **describe_light(scene, settings.fit.max_depth)})
     except RuntimeError as error:
         reason = " ".join(str(error).split())
         raise MivolError(f'fit.integrator = "{name}" cannot be loaded ({reason}): choose "mivol", the default.') from None
@@ -295,7 +297,7 @@ def plan_renders(settings: SceneExperiment, problem: SceneProblem) -> Plan | Non
     if settings.fit.integrator != "mivol":
         return None
     needs = find_needs(problem.scene, problem.batches[0].sensor, survey_scene(problem.scene))
-    return make_plan(needs, Settings(max_depth=settings.fit.max_depth))
+    return make_plan(needs, Settings(**describe_light(problem.scene, settings.fit.max_depth)))
 
 
 class SceneErrors:

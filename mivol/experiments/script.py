@@ -32,7 +32,7 @@ from mivol.optim.parameters import Parameter
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import View
 from mivol.points import Gaussians, read_gaussians
-from mivol.scene.explain import explain_scene, read_settings
+from mivol.scene.explain import describe_light, explain_scene
 from mivol.scene.load import SceneSource, load_scene
 
 Reference: TypeAlias = "np.ndarray | mi.TensorXf | str | os.PathLike[str]"
@@ -84,14 +84,14 @@ class Problem(SceneProblem):
 
 
 def choose_own_integrator(scene: mi.Scene) -> mi.Integrator:
-    """Return the scene's integrator if from mivol and without AOVs, otherwise mivol's integrator with the same depth.
+    """Return the scene's integrator if from mivol and without AOVs, otherwise mivol's integrator for the same light.
 
     Images to fit have no AOVs.
     """
     own = scene.integrator()
     if hasattr(own, "session") and not list(own.aov_names()):
         return own
-    return mi.load_dict({"type": "mivol", "max_depth": read_settings(scene).max_depth})
+    return mi.load_dict({"type": "mivol", **describe_light(scene)})
 
 
 def make_parameters(parameters: Sequence[str | Parameter]) -> list[Parameter]:

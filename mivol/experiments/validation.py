@@ -26,7 +26,7 @@ from mivol.files import write_whole_text
 from mivol.optim.parameters import as_tensor, find
 from mivol.optim.scenes.views import derive_seed
 from mivol.report import figures
-from mivol.scene.explain import read_settings
+from mivol.scene.explain import describe_light
 from mivol.scene.load import LoadedScene
 from mivol.scene.sensors import find_sensor
 from mivol.scene_graph import traverse
@@ -207,15 +207,14 @@ def validate_scene(
     for key in settings.parameters:
         find(key, traverse(scene))
     folder.mkdir(parents=True, exist_ok=True)
-    depth = read_settings(scene).max_depth if settings.max_depth is None else settings.max_depth
-    integrator = mi.load_dict({"type": "mivol", "max_depth": depth})
+    light = describe_light(scene, settings.max_depth)
+    integrator = mi.load_dict({"type": "mivol", **light})
     image, seconds = render_batches(make_passes(scene, camera, integrator), settings)
     doubts = tuple(find_doubts(scene, [camera]))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # doubts are part of the verdict
         prepared = prepare_reference(
-            loaded, folder, max_depth=depth, max_spp=settings.reference_spp, seed=settings.seed + 1, sensor=camera,
-            accept_doubts=True,
+            loaded, folder, **light, max_spp=settings.reference_spp, seed=settings.seed + 1, sensor=camera, accept_doubts=True
         )  # fmt: skip
         (reference,) = complete(iter([prepared]))
     estimate = Estimate.from_result(image)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -40,14 +41,27 @@ UNLIMITED = 0xFFFFFFFF
 
 
 def read_settings(scene: mi.Scene) -> Settings:
-    """Read the settings of the scene's integrator: all settings of mivol, or the depth printed by another integrator."""
+    """Read the settings of the scene's integrator: all of mivol, or the depth and ``hide_emitters`` of another integrator."""
     integrator = scene.integrator()
     session = getattr(integrator, "session", None)
     if session is not None:
         return session.settings
     printed = re.search(r"max_depth ?= ?(-?\d+)", str(integrator))
     depth = Settings().max_depth if printed is None else int(printed.group(1))
-    return Settings(max_depth=-1 if depth == UNLIMITED else depth)
+    hidden = bool(getattr(integrator, "hide_emitters", False))
+    return Settings(max_depth=-1 if depth == UNLIMITED else depth, hide_emitters=hidden)
+
+
+def describe_light(scene: mi.Scene, max_depth: int | None = None) -> dict[str, Any]:
+    """Settings with which any integrator renders the same light as the scene's: its longest path, and its hidden emitters.
+
+    Args:
+        scene: the scene.
+        max_depth: another longest path; None means the scene's.
+    """
+    settings = read_settings(scene)
+    depth = settings.max_depth if max_depth is None else max_depth
+    return {"max_depth": depth, "hide_emitters": settings.hide_emitters}
 
 
 @dataclass(frozen=True)
@@ -79,7 +93,7 @@ def explain_scene(
         Facts and choices with their reasons, and a refusal separately.
     """
     eye = find_sensor(scene, sensor)
-    settings = read_settings(scene) if max_depth is None else Settings(max_depth=max_depth)
+    settings = read_settings(scene) if max_depth is None else Settings(**describe_light(scene, max_depth))
     try:
         survey = survey_scene(scene)
         needs = find_needs(scene, eye, survey, reads_emission=settings.may_draw_emission)

@@ -93,7 +93,7 @@ def test_views_of_different_sizes(variant_rgb, folder: Path, capsys: pytest.Capt
 def test_a_reference_is_rendered_as_the_file_says(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, wanted: float, target: float | None, own: int | None, depth: int
 ) -> None:
-    """Each view with its own depth or that of the fit, up to the samples or the error; an error of 0 is no aim."""
+    """Each view with its own depth or the fit's, emitters hidden as in the scene, up to the samples or the error; 0 is no aim."""
     asked, kept = [], []
     monkeypatch.setattr(references, "prepare_reference", lambda *how, **settings: asked.append((how, settings)) or made)
     monkeypatch.setattr(references, "standard_error", lambda found: "its error")
@@ -102,9 +102,10 @@ def test_a_reference_is_rendered_as_the_file_says(
         fit=SimpleNamespace(max_depth=7), reference=SimpleNamespace(standard_error=wanted, spp=33, seed=5, max_depth=own)
     )
     context = RunContext(chosen, Path(), tmp_path)
-    references.render_views(SimpleNamespace(add=lambda *view: kept.append(view)), context, chosen, "scene", ["a", "b"])
-    settings = {"max_depth": depth, "target_se": target, "max_spp": 33, "seed": 5}
-    assert asked == [(("scene", tmp_path / "references"), {"sensor": view, **settings}) for view in "ab"]
+    loaded = SimpleNamespace(scene=SimpleNamespace(integrator=lambda: SimpleNamespace(hide_emitters=True)))
+    references.render_views(SimpleNamespace(add=lambda *view: kept.append(view)), context, chosen, loaded, ["a", "b"])
+    settings = {"max_depth": depth, "hide_emitters": True, "target_se": target, "max_spp": 33, "seed": 5}
+    assert asked == [((loaded, tmp_path / "references"), {"sensor": view, **settings}) for view in "ab"]
     assert kept == [(view, "its mean", "its error") for view in "ab"]
     assert (tmp_path / "references").is_dir()
 

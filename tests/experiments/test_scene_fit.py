@@ -19,6 +19,7 @@ from tiny_experiment import FIT, PHOTOS, SCENE, TRUTH, assert_explained, files_o
 
 from mivol import config
 from mivol.config import Sought
+from mivol.config.scenes import Scene as SceneFile
 from mivol.errors import MivolError
 from mivol.experiments import scene_fit
 from mivol.experiments.scene_fit import SceneOutputs
@@ -312,6 +313,18 @@ def test_the_first_view_is_measured_with_the_truth_in_the_scene(monkeypatch: pyt
     assert settled.fit.max_depth == 5 and (line.choice, line.reason) == ("max_depth: 5", "so")
     assert asked == [("scene", "camera first of scene", 0.125, 0 if truth is None else 1)]
     assert held == ([] if truth is None else [("scene", "k", "values"), "given back"])
+
+
+@pytest.mark.parametrize(("name", "depth"), [("volpath", -1), ("prbvolpath", 3)])
+def test_an_absent_depth_is_the_depth_of_the_scene(variant_rgb, name: str, depth: int) -> None:
+    """The fit renders the same light as the scene's integrator: emitters hidden there are hidden here."""
+    wanted = {"type": name, "max_depth": depth, "hide_emitters": True}
+    scene = mi.load_dict({"type": "scene", "integrator": wanted})
+    chosen = config.SceneExperiment(title="t", scene=SceneFile(file="s.xml"), parameter=(Sought(key="k"),))
+    settled, (line,) = scene_fit.resolve_depth(chosen, SimpleNamespace(scene=scene), None)
+    assert settled.fit.max_depth == depth and line.choice == f"max_depth: {depth}"
+    drawn = scene_fit.make_integrator(settled, scene).session.settings
+    assert (drawn.max_depth, drawn.hide_emitters) == (depth, True)
 
 
 def test_a_depth_that_is_given_is_not_measured() -> None:
