@@ -111,10 +111,15 @@ class ScanFit(FitKind):
             say(f"  data      {note}")
         self.record.notes += self.data.notes
         say(f"  held out  {len(self.held_out)} views")
-        iterations = GAIN_ITERATIONS if getattr(self.settings.data, "rings", "none") == "fit" else ITERATIONS
+        has_gains = getattr(self.settings.data, "rings", "none") == "fit"
+        may_be_direct = not (has_gains or getattr(self.settings.data, "drift", 0))
         walk = Projector(self.data.geometry, grid, self.kept)
-        solve, self.choices = resolve_solver(self.settings.solve, walk, iterations)
+        iterations = GAIN_ITERATIONS if has_gains else ITERATIONS
+        solve, self.choices = resolve_solver(self.settings.solve, walk, iterations, may_be_direct)
         self.settings = msgspec.structs.replace(self.settings, solve=solve)
+        if solve.name in DIRECT:
+            about = self.describe_run()
+            self.record.method, self.record.citations = about["method"], about["citations"]
         self.record.plan += self.choices
         self.projector = make_projector(self.settings, self.data, grid)
 

@@ -31,7 +31,7 @@ from mivol.optim.projections.linear_problems import (
 from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.report.record import PlanLine
 from mivol.tomography.filtered import check_directions
-from mivol.tomography.geometry import VoxelGrid, subdivide_grid
+from mivol.tomography.geometry import ParallelBeam, VoxelGrid, subdivide_grid
 from mivol.tomography.projector import Projector
 from mivol.tomography.stored import is_worth_storing, matrix_bytes, store_matrix
 
@@ -51,8 +51,39 @@ ITERATIONS, GAIN_ITERATIONS = 20, 60
 """Iterations if the settings leave them open, without and with unknown gains of the pixels."""
 
 
+MOST_STEPS = 60_000_000_000
+"""Largest number of steps from cell to cell in all iterations that "auto" chooses: four minutes of processor time."""
+
+
+def choose_direct(settings: config.SolveSettings, walk: Projector, iterations: int) -> PlanLine | None:
+    """The reason to take filtered back-projection as "auto"; None to iterate.
+
+    Iterations beyond ``MOST_STEPS`` are left out if the views suffice: as many as columns, in directions that filtered
+    back-projection takes. A setting of the iterations is a wish to iterate.
+    """
+    views, _, columns = walk.projection_shape
+    wishes = (settings.iterations, settings.start, settings.supersampling, settings.tv, settings.discrepancy or None)
+    if settings.name != AUTO or settings.storage != "auto" or any(wish is not None for wish in wishes) or views < columns:
+        return None
+    try:
+        check_directions(walk)
+    except MivolError:
+        return None
+    grid = subdivide_grid(walk.grid, resolve_supersampling(settings, walk)[0], walk.geometry)
+    across = grid.shape[1:] if isinstance(walk.geometry, ParallelBeam) else grid.shape
+    steps = 2 * iterations * math.prod(walk.projection_shape) * sum(across)
+    if steps <= MOST_STEPS:
+        return None
+    name = "fbp" if isinstance(walk.geometry, ParallelBeam) else "fdk"
+    reason = (
+        f"{iterations} iterations of pcg take {steps / 1e9:.3g} thousand million steps from cell to cell, of at most "
+        f'{MOST_STEPS / 1e9:g}, and the {views} views are no fewer than the {columns} columns (solve.name = "pcg" iterates)'
+    )
+    return PlanLine(choice=f"solver: {name}", reason=reason)
+
+
 def resolve_solver(
-    settings: config.SolveSettings, walk: Projector, iterations: int = ITERATIONS
+    settings: config.SolveSettings, walk: Projector, iterations: int = ITERATIONS, may_be_direct: bool = False
 ) -> tuple[config.SolveSettings, list[PlanLine]]:
     """Put values in place of all open settings.
 
@@ -60,11 +91,16 @@ def resolve_solver(
         settings: settings of a file.
         walk: projector of the fitted views, through the requested voxels.
         iterations: iterations if the settings leave them open.
+        may_be_direct: whether "auto" may be a single step (:func:`choose_direct`).
 
     Returns:
         Complete settings, and their reasons.
     """
     name = settings.solver
+    if may_be_direct and (line := choose_direct(settings, walk, settings.iterations or iterations)):
+        direct = "fbp" if isinstance(walk.geometry, ParallelBeam) else "fdk"
+        given = {"name": direct, "start": "empty", "supersampling": 1, "tv": 0.0}
+        return msgspec.structs.replace(settings, iterations=iterations, **given), [line]
     start, start_line = resolve_start(settings, walk)
     parts, parts_line = resolve_supersampling(settings, walk)
     settled = msgspec.structs.replace(

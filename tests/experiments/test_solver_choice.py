@@ -64,6 +64,28 @@ def test_finer_unknowns_are_taken_where_they_fit(variant_rgb: str, monkeypatch: 
     assert settled(config.SolveSettings(supersampling=3), cone)[0].supersampling == 3
 
 
+@pytest.mark.parametrize(("name", "steps"), [("fbp", 2 * 20 * 12 * 2 * 9 * 24), ("fdk", 2 * 20 * 12 * 2 * 9 * 28)])
+def test_long_iterations_over_many_views_become_a_single_step(
+    variant_rgb: str, monkeypatch: pytest.MonkeyPatch, name: str, steps: int
+) -> None:
+    """20 iterations of two products, 12 x 2 x 9 rays, and 12 + 12 cells across the light (a cone: 4 along z, too)."""
+    geometry = ParallelBeam(HALF, (2, 9)) if name == "fbp" else ConeBeam(ROUND, (2, 9), 20.0, 30.0)
+
+    def chosen(geometry: Geometry, **wishes: object) -> str:
+        return resolve_solver(config.SolveSettings(**wishes), Projector(geometry, GRID), may_be_direct=True)[0].name
+
+    monkeypatch.setattr(solver_choice, "MOST_STEPS", steps)
+    assert chosen(geometry) == "pcg"
+    monkeypatch.setattr(solver_choice, "MOST_STEPS", steps - 1)
+    found, (line,) = resolve_solver(config.SolveSettings(), Projector(geometry, GRID), may_be_direct=True)
+    assert (found.name, found.supersampling, found.tv, found.start) == (name, 1, 0.0, "empty")
+    assert line.choice == f"solver: {name}" and 'solve.name = "pcg" iterates' in line.reason
+    assert {chosen(geometry, **wish) for wish in ({"tv": 1.0}, {"iterations": 20}, {"name": "pcg"})} == {"pcg"}
+    few, gap = replace(geometry, detector=(2, 13)), replace(geometry, angles=geometry.angles / 4)
+    assert chosen(few) == chosen(gap) == "pcg"
+    assert settled(config.SolveSettings(), geometry)[0].name == "pcg"
+
+
 def test_what_a_file_says_holds(variant_rgb: str) -> None:
     """A solver that is named begins empty, at the voxels and without a prior; keys of "auto" that are given stay."""
     cone = ConeBeam(ROUND, (2, 9), 20.0, 30.0)
