@@ -5,7 +5,7 @@ once from an input. A step sends each worker the arrays of the step and the part
 the owner adds the sums of the workers, in float64 (:func:`mivol.optim.problem.add_parts`). A part is the same wherever it is
 computed, so the result does not depend on the number of workers, on their order, or on a lost one.
 
-Twins of photographs and of projectors are here, twins of scenes in :mod:`mivol.cluster.scene_steps`.
+Twins of photographs and of projectors are here, twins of scenes in :mod:`mivol.cluster.distribution`.
 """
 
 from __future__ import annotations

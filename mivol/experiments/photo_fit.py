@@ -26,7 +26,7 @@ from mivol.optim.loop import Course, Fit
 from mivol.optim.optimizer import Optimizer
 from mivol.optim.photographs.field_view import FieldView
 from mivol.photos import Camera, Photo
-from mivol.photos.alignment import align_camera
+from mivol.photos.camera import align_camera
 from mivol.photos.camera_path import HomeView, find_home_view
 from mivol.photos.photo_file import CONVERSIONS
 from mivol.photos.region import FEWEST_VIEWS, find_free_distances, viewing_distance

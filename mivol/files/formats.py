@@ -22,7 +22,6 @@ from mivol.errors import MivolError
 from mivol.files import (
     dicom,
     hdf5,
-    matlab,
     metaimage,
     mrc,
     nifti,
@@ -106,7 +105,7 @@ FORMATS: dict[str, VolumeFormat] = {
     ".st": _MRC,
     ".ali": _MRC,
     ".dcm": _DICOM,
-    ".mat": VolumeFormat("MATLAB", _starts_with(matlab.MAGIC), matlab.read_matlab),
+    ".mat": VolumeFormat("MATLAB", _starts_with(hdf5.MATLAB_MAGIC), hdf5.read_matlab),
     ".tif": _TIFF,
     ".tiff": _TIFF,
     ".zarr": _ZARR,

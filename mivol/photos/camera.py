@@ -1,4 +1,4 @@
-"""The camera of a photograph: rays of image points, and image points of world points.
+"""The camera of a photograph: rays of image points, image points of world points, and a pose corrected by renders.
 
 Conventions. **Camera to world as in OpenGL and NeRF: x to the right, y up, the camera looks along -z**; a rotation and a
 position, no scale. An image point is (x, y) in pixels from the upper left **corner**, so the pixel of row i, column j has its
@@ -8,6 +8,7 @@ centre at (j + 1/2, i + 1/2). ``K`` is OpenCV's matrix in these coordinates, wit
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -216,3 +217,56 @@ def _check_pose(matrix: np.ndarray, K: np.ndarray, size: tuple[int, int], name: 
         )
     pose[:3, :3] = u @ vt
     return pose
+
+
+# -- Correction of a pose ----------------------------------------------------------------------------------------------------
+
+
+ALIGNMENT_ITERATIONS = 4
+"""Iterations of an alignment: seven renders each."""
+
+MOTION_STEP = 0.5
+"""Difference of a motion for derivatives [pixel]."""
+
+DAMPING = 0.01, 0.1, 10.0
+"""First damping, relative to the diagonal, and its factors after a better and a worse step."""
+
+
+def align_camera(
+    render: Callable[[Camera], np.ndarray], camera: Camera, image: np.ndarray, mask: np.ndarray | None, distance: float
+) -> Camera:
+    """Return the camera whose render is nearest to a photograph by least squares, searched near the given pose.
+
+    A motion has six numbers [pixel]: a rotation about the camera's position and a translation, both in the axes of the world,
+    each in units that move the image of the subject by about a pixel. Derivatives are differences of renders. Source: Levenberg
+    1944, Marquardt 1963 (damped least squares).
+
+    Args:
+        render: view (H, W, 3) of a model from a camera.
+        camera: camera of the photograph.
+        image: the photograph (H, W, 3).
+        mask: (H, W) bool, False for pixels that do not count; None: all pixels count.
+        distance: of the subject from the camera [length].
+    """
+    unit = np.repeat([1.0, distance], 3) / camera.K[0, 0]
+    used = np.ones(image.shape[:2], bool) if mask is None else mask
+
+    def error(motion: np.ndarray) -> np.ndarray:
+        move = motion * unit
+        return (render(move_camera(camera, move[:3], move[3:])) - image)[used].ravel()
+
+    motion, damping = np.zeros(6), DAMPING[0]
+    residual = error(motion)
+    for _ in range(ALIGNMENT_ITERATIONS):
+        slopes = np.stack([(error(motion + MOTION_STEP * axis) - residual) / MOTION_STEP for axis in np.eye(6)], axis=1)
+        normal, gradient = slopes.T @ slopes, slopes.T @ residual
+        if not np.trace(normal) > 0:  # the model shows nothing that a motion would change
+            break
+        diagonal = np.diag(np.maximum(np.diag(normal), 1e-6 * np.trace(normal)))
+        tried = motion - np.linalg.solve(normal + damping * diagonal, gradient)
+        moved = error(tried)
+        is_better = moved @ moved < residual @ residual
+        motion, residual = (tried, moved) if is_better else (motion, residual)
+        damping *= DAMPING[1] if is_better else DAMPING[2]
+    move = motion * unit
+    return move_camera(camera, move[:3], move[3:])

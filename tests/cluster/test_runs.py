@@ -19,11 +19,10 @@ from local_workers import kill_once, kill_worker, some_workers
 from tiny_experiment import PHOTOS, run, write_experiment
 
 from mivol import config
-from mivol.cluster.distribution import ClusterDistribution
+from mivol.cluster.distribution import ClusterDistribution, SharedSceneProblem
 from mivol.cluster.packages import SceneSource, share_scene
 from mivol.cluster.pool import Pool, Unit
 from mivol.cluster.reference import complete_on, passes_on
-from mivol.cluster.scene_steps import SharedSceneProblem
 from mivol.cluster.sweep import run_on
 from mivol.cluster.workplace import Workplace
 from mivol.errors import MivolError

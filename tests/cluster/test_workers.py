@@ -17,8 +17,10 @@ from syntax import tree_of
 from tiny_experiment import refused, write_experiment
 
 from mivol import config
+from mivol.bench.studies.cluster import Network, Workload, best_workers, say_limit, step_seconds
 from mivol.cluster.address import ClusterSettings, is_loopback, parse_cluster
 from mivol.cluster.connection import _collect_failures, _connect, _connect_address, import_distributed
+from mivol.cluster.distribution import make_blocks
 from mivol.cluster.packages import (
     decode_sensor,
     encode_sensor,
@@ -30,8 +32,6 @@ from mivol.cluster.packages import (
 )
 from mivol.cluster.pool import Pool, Unit, _Worker, check_equal_workers, check_worker
 from mivol.cluster.reference import LONGEST_UNIT, _View
-from mivol.cluster.scaling import Network, Workload, best_workers, say_limit, step_seconds
-from mivol.cluster.scene_steps import make_blocks
 from mivol.cluster.sweep import WorkerProgress, has_absolute_paths, read_files, write_run
 from mivol.cluster.workplace import Facts, Failure, Workplace, find_facts
 from mivol.doctor import FAULT, Finding

@@ -12,8 +12,7 @@ from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.photos import Camera, intrinsics, load_photos, project, rays, survey_photos
-from mivol.photos.alignment import align_camera
-from mivol.photos.camera import move_camera
+from mivol.photos.camera import align_camera, move_camera
 from mivol.photos.lens import Panorama
 from mivol.photos.region import (
     FEWEST_VIEWS,
