@@ -93,7 +93,7 @@ def test_views_of_different_sizes(variant_rgb, folder: Path, capsys: pytest.Capt
 def test_a_reference_is_rendered_as_the_file_says(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, wanted: float, target: float | None, own: int | None, depth: int
 ) -> None:
-    """Each view with its own depth or the fit's, emitters hidden as in the scene, up to the samples or the error; 0 is no aim."""
+    """Each view with its own depth or the fit's, emitters hidden as its own, up to the samples or the error; 0 is no aim."""
     asked, kept = [], []
     monkeypatch.setattr(references, "prepare_reference", lambda *how, **settings: asked.append((how, settings)) or made)
     monkeypatch.setattr(references, "standard_error", lambda found: "its error")
