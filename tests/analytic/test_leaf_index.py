@@ -9,6 +9,7 @@ import pytest
 from octrees import PLACE, random_octree
 
 from mivol.fields.octree import Octree, edges_of
+from mivol.kernel_recording import ALIGNMENT
 from mivol.transport.traversal.leaf_index import LeafIndex, find_octant
 from mivol.transport.traversal.octree_walk import clip_to_octree
 
@@ -55,3 +56,20 @@ def test_vacuum_is_crossed_in_few_steps(variant_rgb: str) -> None:
             break
     # 64 entries along an axis, at most 12 of them a step.
     assert steps <= 7
+
+
+def test_an_octant_beside_a_leaf_is_crossed_together_with_the_next_one(variant_rgb: str) -> None:
+    """Octant (1, 1, 1) lies in the brick of the only leaf: free upwards, and the leaf's octant is next downwards."""
+    tree = Octree.from_rows(3, PLACE, np.zeros(1, np.uint64), np.zeros(1, np.uint8), np.ones(1), np.zeros((1, 1, 3)))
+    index, cell = LeafIndex.find(tree), mi.Vector3i(2, 2, 2)
+    for signs, expected in (((1, 1, 1), 2), ((1, 1, -1), 2), ((-1, -1, -1), 0)):
+        _, is_leaf, edge, beyond = index.look_up(cell, find_octant(mi.Vector3f(*signs)), mi.Bool(True))
+        assert not is_leaf[0] and edge[0] == 2 and np.array(beyond).ravel().tolist() == [expected] * 3
+
+
+def test_records_are_read_as_packets(variant_rgb: str) -> None:
+    """Dr.Jit splits the read of a record at an unaligned address into four, and views take a tenth longer."""
+    tree = random_octree(8, split=0.35)
+    index = LeafIndex.find(tree)
+    if dr.backend_v(index.halves) == dr.JitBackend.LLVM:
+        assert index.halves.numpy().ctypes.data % ALIGNMENT == 0

@@ -2,10 +2,10 @@
 
 A record describes 4 x 4 x 2 cells, half a brick: a bit for each cell with matter, a bit for each cell that begins a leaf, and
 the number of leaves before. Bits, like leaves, stand in the order of codes, so the row of a leaf is that number plus the count
-of leaves that begin up to its cell. An octant of vacuum has a reach r: the ray may cross r - 1 more octants on every side
-(Chebyshev distance). Up to 256 cells along an axis there is a record for every half brick, and a look-up reads one record.
-A brick of vacuum then has a free box for each octant of directions: bricks along x, y and z that a ray may cross. A brick in
-a larger leaf has its row and its edge.
+of leaves that begin up to its cell. An octant of vacuum has a bit for each octant of directions, set if the seven octants
+beside it on that side are vacuum too: a ray may cross two octants along each axis. Up to 256 cells along an axis there is a
+record for every half brick, and a look-up reads one record. A brick of vacuum then has a free box for each octant of
+directions: bricks along x, y and z that a ray may cross. A brick in a larger leaf has its row and its edge.
 
 In deeper octrees most bricks are vacuum. A table holds an entry for each of 2^top cells along each axis. An entry is a leaf,
 vacuum, or the number of a brick of 4 x 4 x 4 entries, each a quarter of the edge; bricks nest until their entries are cells,
@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.fields.octree import Octree, cells_of, edges_of, separate
-from mivol.transport.traversal.grid_blocks import find_distances
+from mivol.kernel_recording import copy_aligned
 
 __all__ = ["LeafIndex", "find_octant"]
 
@@ -50,7 +50,7 @@ DENSE = 8
 """Largest depth at which every half brick has a record: 8 MiB."""
 
 FINE = 9
-"""Largest depth at which octants have reaches: the distances of 256^3 octants."""
+"""Largest depth at which the surroundings of octants are known: bits of 256^3 octants."""
 
 LONGEST = 15
 """Longest edge of a free box [bricks]: 4 bits."""
@@ -66,9 +66,10 @@ class LeafIndex:
         table: UInt32, an entry for each cell of the table, x fastest; a dummy up to the depth ``DENSE``.
         bricks: UInt32, 64 entries a brick, x fastest; a dummy without bricks of entries.
         halves: UInt32, a record of 4 numbers for each half brick: cells with matter, cells that begin a leaf, leaves before it,
-            and a byte for the reach of each octant. Up to the depth ``DENSE`` the first number is 0 in a brick of vacuum, and
-            the others hold the edges of its free boxes along x, y and z, 4 bits for each octant of directions; in a larger
-            leaf they are no beginning, its row plus 1, and its edge minus 1 [cells].
+            and a byte for each octant with a bit for each octant of directions, set if the next octants are free too. Up to
+            the depth ``DENSE`` the first number is 0 in a brick of vacuum, and the others hold the edges of its free boxes
+            along x, y and z, 4 bits for each octant of directions; in a larger leaf they are no beginning, its row plus 1,
+            and its edge minus 1 [cells].
         from_world: (3, 4) map from the world to cells: cell (i, j, k) begins at (i, j, k).
         low, high: first cell with a leaf, and the cell after the last one, along x, y and z: rays are clipped to this box.
     """
@@ -98,7 +99,7 @@ class LeafIndex:
         ends = ([dr.opaque(mi.Float64, float(v)) for v in end] for end in (low, high))
         dummy = np.zeros(1, np.uint32)
         top, *tables = (0, dummy, dummy, _make_records(tree)) if depth <= DENSE else _make_tables(tree)
-        tables = (mi.UInt32(np.ascontiguousarray(a).reshape(-1)) for a in tables)
+        tables = (mi.UInt32(copy_aligned(np.ascontiguousarray(a).reshape(-1))) for a in tables)
         return cls(depth, top, *tables, from_world, *ends)
 
     def look_up(
@@ -135,11 +136,11 @@ class LeafIndex:
         far = mi.Int32(((2 + (code & 1)) << (code >> 1)) >> 1)
         size = dr.select(is_far, self.depth - self.top, size)
         half = 2 * (entry & (BRICK - 1)) + mi.UInt32((cell.z >> 1) & 1)
-        found = HalfBrick.read(self.halves, half, cell, active & is_brick)
+        found = HalfBrick.read(self.halves, half, cell, towards, active & is_brick)
         row = dr.select(is_brick, found.row, entry & ROW_MASK)
         is_leaf = dr.select(is_brick, found.is_leaf, (entry & ROW_MASK) < FIRST_REACH) & ~is_far
         size = dr.select(is_brick, dr.select(found.is_large, mi.Int32(1), 0), size)
-        reach = dr.select(is_brick, found.reach, dr.select(is_far, far, 1))
+        reach = dr.select(is_brick, found.more + 1, dr.select(is_far, far, 1))
         return row, is_leaf, mi.Int32(1) << size, mi.Vector3i((reach - 1) << size)
 
     def _look_up_record(
@@ -148,13 +149,13 @@ class LeafIndex:
         """The look-up where every half brick has a record."""
         across = _bricks_across(self.depth).bit_length() - 1
         half = (cell.x >> 2) | ((cell.y >> 2) << across) | ((cell.z >> 1) << (2 * across))
-        found = HalfBrick.read(self.halves, mi.UInt32(half), cell, active)
+        found = HalfBrick.read(self.halves, mi.UInt32(half), cell, towards, active)
         is_larger = found.is_leaf & (found.begins == 0)
-        boxes = [(word >> (4 * towards)) & LONGEST for word in (found.begins, found.before, found.reaches)]
+        boxes = [(word >> (4 * towards)) & LONGEST for word in (found.begins, found.before, found.beside)]
         # In an empty half of another brick, no leaf begins, and the first edge is 0.
         is_far = (found.filled == 0) & (boxes[0] > 0)
-        edge = dr.select(is_larger, mi.Int32(found.reaches) + 1, dr.select(found.is_large, mi.Int32(2), 1))
-        near = dr.select(found.is_leaf, 0, 2 * found.reach - 2)
+        edge = dr.select(is_larger, mi.Int32(found.beside) + 1, dr.select(found.is_large, mi.Int32(2), 1))
+        near = dr.select(is_larger, 0, 2 * found.more)
         beyond = mi.Vector3i(*(dr.select(is_far, 4 * mi.Int32(box) - 4, near) for box in boxes))
         return found.row, found.is_leaf, dr.select(is_far, 4, edge), beyond
 
@@ -164,34 +165,33 @@ class HalfBrick:
     """Cells in their half bricks.
 
     Attributes:
-        filled, begins, before, reaches: the numbers of the record.
+        filled, begins, before, beside: the numbers of the record.
         row: row of the leaf.
         is_leaf: whether there is a leaf.
         is_large: whether a leaf or vacuum fills the octant of the cell.
-        reach: reach of the octant; 1 with a leaf.
+        more: octants beyond the own one, along each axis, that are vacuum too: 0 or 1; 0 beside a leaf.
     """
 
     filled: mi.UInt32
     begins: mi.UInt32
     before: mi.UInt32
-    reaches: mi.UInt32
+    beside: mi.UInt32
     row: mi.UInt32
     is_leaf: mi.Bool
     is_large: mi.Bool
-    reach: mi.Int32
+    more: mi.Int32
 
     @classmethod
-    def read(cls, halves: mi.UInt32, half: mi.UInt32, cell: mi.Vector3i, active: mi.Bool) -> HalfBrick:
-        """Read the record number ``half``, and find cells in it."""
-        filled, begins, before, reaches = dr.gather(mi.ArrayXu, halves, half, active, shape=(4, 1))
+    def read(cls, halves: mi.UInt32, half: mi.UInt32, cell: mi.Vector3i, towards: mi.UInt32, active: mi.Bool) -> HalfBrick:
+        """Read the record number ``half``, and find cells in it; ``towards`` is the octant of the ray's direction."""
+        filled, begins, before, beside = dr.gather(mi.ArrayXu, halves, half, active, shape=(4, 1))
         octant = mi.UInt32((cell.x & 2) << 2 | (cell.y & 2) << 3)
         bit = mi.UInt32((cell.x & 1) | (cell.y & 1) << 1 | (cell.z & 1) << 2) | octant
         row = before + dr.popcnt(begins & ((mi.UInt32(2) << bit) - 1)) - 1
         own, own_begins = ((word >> octant) & 0xFF for word in (filled, begins))
-        is_empty = own == 0
-        is_large = is_empty | ((own == 0xFF) & (own_begins == 1))
-        reach = dr.select(is_empty, mi.Int32((reaches >> octant) & 0xFF), 1)
-        return cls(filled, begins, before, reaches, row, ((filled >> bit) & 1) > 0, is_large, reach)
+        is_large = (own == 0) | ((own == 0xFF) & (own_begins == 1))
+        more = mi.Int32((beside >> (octant + towards)) & 1)
+        return cls(filled, begins, before, beside, row, ((filled >> bit) & 1) > 0, is_large, more)
 
 
 def _bricks_across(depth: int) -> int:
@@ -209,8 +209,8 @@ def _make_records(tree: Octree) -> np.ndarray:
     _mark_leaves(tree, fine, records.reshape(-1, 4), ((z >> 1) * n + (y >> 2)) * n + (x >> 2))
     if tree.depth > 1:
         # Octants along z, y and x; a byte for each of the four in a half, x lowest.
-        reach = _octant_reaches(tree).reshape(n, 2, n, 2, n, 2).transpose(0, 1, 2, 4, 3, 5).reshape(n, 2, n, n, 4)
-        records[..., 3] = np.ascontiguousarray(reach).view("<u4")[..., 0]
+        beside = _octant_surroundings(tree).reshape(n, 2, n, 2, n, 2).transpose(0, 1, 2, 4, 3, 5).reshape(n, 2, n, n, 4)
+        records[..., 3] = np.ascontiguousarray(beside).view("<u4")[..., 0]
     codes, which = _spread(tree.codes[larger] >> np.uint64(6), size[larger] - 2)
     x, y, z = separate(codes, max(tree.depth - 2, 0)).T
     leaf = larger[which]
@@ -229,8 +229,7 @@ def _free_boxes(empty: np.ndarray) -> np.ndarray:
     """
     packed = np.zeros((3, *empty.shape), np.uint32)
     for octant in range(8):
-        # Axes z, y, x; an octant with its bit set runs downwards along the axis.
-        turn = tuple(slice(None, None, -1 if octant >> axis & 1 else 1) for axis in (2, 1, 0))
+        turn = _upwards(octant)
         free = empty[turn]
         runs = [_run_lengths(free, 2 - axis) for axis in range(3)]
         box = np.stack([free.astype(np.uint8)] * 3)
@@ -316,21 +315,37 @@ def _make_halves(tree: Octree, bricks: np.ndarray) -> np.ndarray:
     half = 2 * np.searchsorted(bricks, codes >> np.uint64(6)) + (codes >> np.uint64(5) & np.uint64(1)).astype(np.int64)
     records = np.zeros((2 * len(bricks), 4), np.uint32)
     _mark_leaves(tree, fine, records, half)
-    records[:, 3] = 0x01010101
     if tree.depth <= FINE:
         octants = (bricks[:, None] << np.uint64(3)) + np.arange(8, dtype=np.uint64)
         x, y, z = separate(octants.reshape(-1), tree.depth - 1).T
-        records[:, 3] = _octant_reaches(tree)[z, y, x].view("<u4")
+        records[:, 3] = _octant_surroundings(tree)[z, y, x].view("<u4")
     return records
 
 
-def _octant_reaches(tree: Octree) -> np.ndarray:
-    """Reach (Z, Y, X) of each octant of two cells an edge, uint8; 1 in octants with a leaf."""
+def _octant_surroundings(tree: Octree) -> np.ndarray:
+    """A byte (Z, Y, X) for each octant of two cells an edge: the directions in which it begins a free cube of two octants."""
     n = 1 << (tree.depth - 1)
     is_filled = np.zeros(n**3, bool)
     octants, _ = _spread(tree.codes >> np.uint64(3), np.maximum(tree.sizes.astype(np.int64) - 1, 0))
     is_filled[_flat(separate(octants, tree.depth - 1), n)] = True
-    return np.maximum(np.array(find_distances(mi.Bool(is_filled), (n, n, n))), 1).astype(np.uint8).reshape(n, n, n)
+    free, bits = ~is_filled.reshape(n, n, n), np.zeros((n, n, n), np.uint8)
+    for octant in range(8):
+        turn = _upwards(octant)
+        bits[turn] |= _grow_cubes(free[turn]).astype(np.uint8) << np.uint8(octant)
+    return bits
+
+
+def _upwards(octant: int) -> tuple[slice, ...]:
+    """Index along z, y and x that turns an array so that directions of an octant run upwards."""
+    return tuple(slice(None, None, -1 if octant >> axis & 1 else 1) for axis in (2, 1, 0))
+
+
+def _grow_cubes(free: np.ndarray) -> np.ndarray:
+    """Blocks from which a free cube runs upwards, larger by a block than the free cubes of ``free``. Outside all is free."""
+    # A cube of the edge r is free if the eight cubes of the edge r - 1 at its corners are.
+    for axis in range(3):
+        free = free & _next_along(free, axis, True)
+    return free
 
 
 def _flat(place: np.ndarray, n: int) -> np.ndarray:
@@ -383,14 +398,11 @@ def _mark_far_vacuum(table: np.ndarray, n: int) -> None:
     is_filled = table > 0
     vacuum = np.full(len(table), FAR, np.uint32)
     for octant in range(8):
-        # Axes z, y, x; an octant with its bit set runs downwards along the axis.
-        turn = tuple(slice(None, None, -1 if octant >> axis & 1 else 1) for axis in (2, 1, 0))
+        turn = _upwards(octant)
         free = ~is_filled.reshape(n, n, n)[turn]
         code = np.zeros((n, n, n), np.uint32)
         for reach in range(2, REACHES[-1] + 1):
-            # A cube of the edge r is free if the eight cubes of the edge r - 1 at its corners are; outside all is free.
-            for axis in range(3):
-                free = free & _next_along(free, axis, True)
+            free = _grow_cubes(free)
             if reach in REACHES:
                 code[free] = CODES[REACHES.index(reach)]
         vacuum |= code[turn].reshape(-1) << np.uint32(3 * octant)
