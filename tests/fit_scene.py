@@ -27,23 +27,23 @@ def absorbing_scene(values: np.ndarray) -> mi.Scene:
     )
 
 
-def film(size: int, rfilter: str = "box") -> dict:
-    """A square rgb film."""
+def film(size: int, rfilter: str = "box", pixel_format: str = "rgb") -> dict:
+    """A square film."""
     return {
         "type": "hdrfilm",
         "width": size,
         "height": size,
-        "pixel_format": "rgb",
+        "pixel_format": pixel_format,
         "component_format": "float32",
         "rfilter": {"type": rfilter},
     }
 
 
-def camera(angle: float, size: int = 8, rfilter: str = "box") -> mi.Sensor:
+def camera(angle: float, size: int = 8, rfilter: str = "box", pixel_format: str = "rgb") -> mi.Sensor:
     """A perspective camera on a circle of radius 4 about the cube; ``angle`` in radians."""
     origin = [4 * np.cos(angle), 1.0, 4 * np.sin(angle)]
     pose = mi.ScalarTransform4f().look_at(origin=origin, target=[0, 0, 0], up=[0, 1, 0])
-    return mi.load_dict({"type": "perspective", "fov": 35, "to_world": pose, "film": film(size, rfilter)})
+    return mi.load_dict({"type": "perspective", "fov": 35, "to_world": pose, "film": film(size, rfilter, pixel_format)})
 
 
 def frontal(size: int = 4) -> mi.Sensor:

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from false_alarms import assert_precise, assert_same_mean, fresh
-from fit_scene import KEY, absorbing_scene, camera, film, frontal, small_problem
+from fit_scene import KEY, absorbing_scene, camera, film, frontal, small_problem, views_of_truth
 
 from mivol.errors import MivolError
 from mivol.optim.events import Evaluate, Upsample
@@ -384,3 +384,25 @@ def test_nonfinite_loss_stops_the_run(variant_rgb) -> None:
 def test_gauss_newton_refuses_other_losses(variant_rgb) -> None:
     with pytest.raises(MivolError, match='"l2" or "relative_l2"'):
         reconstruct(small_problem(loss=Huber()), GaussNewton(), 1)
+
+
+@pytest.mark.parametrize("references", ["rgb", "rgba"])
+def test_the_alpha_of_a_film_is_not_fitted(variant_rgb, references: str) -> None:
+    """Loss, gradient and curvature are those of the film without alpha, with references that have alpha or not."""
+    truth, start = np.random.default_rng(3).uniform(0, 2, (4, 4, 4, 1)), np.full((4, 4, 4, 1), 0.3)
+    found = {}
+    for pixel_format in ("rgb", "rgba"):
+        sensor = camera(0.3, rfilter="tent", pixel_format=pixel_format)
+        (view,) = views_of_truth(truth, [sensor])
+        (seen,) = views_of_truth(truth, [camera(0.3, rfilter="tent", pixel_format=references)])
+        view = View(view.name, sensor, seen.reference if pixel_format == "rgba" else view.reference)
+        problem = SceneProblem(absorbing_scene(start), [view], [Parameter(KEY, "1/length", (0.0, np.inf), lr=0.1)], spp=4)
+        reals = problem.initial_reals()
+        loss, gradient = problem.loss_and_gradient(reals, 0)
+        curved = problem.linearize(reals).curvature({KEY: mi.TensorXf(np.ones((4, 4, 4, 1), np.float32))})
+        found[pixel_format] = loss, np.array(gradient[KEY]), np.array(curved[KEY])
+    for plain, with_alpha in zip(found["rgb"], found["rgba"], strict=True):
+        # Threads add the 64 x 4 samples to 9 pixels each in any order: each addition rounds by 2^-24 of the sum.
+        rounding = 64 * 4 * 9 * 2**-24 * np.abs(plain).max()
+        np.testing.assert_allclose(with_alpha, plain, rtol=0, atol=rounding)
+        assert np.abs(plain).max() > 0

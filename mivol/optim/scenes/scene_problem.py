@@ -33,11 +33,14 @@ from mivol.optim.scenes.views import (
     PRIMAL,
     RenderBatch,
     View,
+    add_alpha,
     check_views,
     count_pixels,
     derive_seed,
+    drop_alpha,
     make_batches,
     make_single_batches,
+    remove_alpha,
 )
 from mivol.scene_graph import traverse
 
@@ -76,6 +79,7 @@ class SceneProblem(LinearizableProblem):
 
     def __post_init__(self) -> None:
         check_views(self.views)
+        self.views = [remove_alpha(view) for view in self.views]
         if not self.parameters:
             raise MivolError("found no parameter to fit: name at least one key of mi.traverse(scene).")
         self.integrator = self.integrator or self.scene.integrator()
@@ -194,7 +198,7 @@ class SceneProblem(LinearizableProblem):
                 image = self.integrator.render(self.scene, sensor, seed=derive_seed(seed, number), spp=share)
                 total = image * share if total is None else total + image * share
             self._finish(total, share * count_pixels(sensor))
-        return total / spp
+        return drop_alpha(total / spp, sensor)
 
     def images(self, count: int = 3) -> list[tuple[str, np.ndarray, np.ndarray]]:
         """Name, reference and present render of the first views, for notebooks."""
@@ -203,6 +207,7 @@ class SceneProblem(LinearizableProblem):
 
     def vjp(self, sensor: mi.Sensor, adjoint: mi.TensorXf, seed: int) -> None:
         """Add J^T adjoint of a sensor's image to the gradients of the scene's parameters."""
+        adjoint = add_alpha(adjoint, sensor)
         for number, spp in enumerate(self.passes(sensor, self.spp)):
             with require_derivative(", ".join(p.name for p in self.parameters)):
                 self.integrator.render_backward(
@@ -218,7 +223,7 @@ class SceneProblem(LinearizableProblem):
             image = self.integrator.render_forward(self.scene, self.params, sensor, derive_seed(seed, number), spp)
             total = dr.detach(image) * spp if total is None else total + dr.detach(image) * spp
             self._finish(total, spp * count_pixels(sensor))
-        return total / self.spp
+        return drop_alpha(total / self.spp, sensor)
 
     def _set_tangents(self, tangents: Reals) -> None:
         """Set the tangents, before each render: some integrators consume tangents."""

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -87,6 +88,12 @@ def check_views(views: Sequence[View]) -> None:
             )
 
 
+def remove_alpha(view: View) -> View:
+    """A view whose reference has colours only, where its film and its reference have alpha."""
+    alpha = has_alpha(view.sensor) and view.reference.shape[2] in (2, 4)
+    return replace(view, reference=drop_alpha(view.reference, view.sensor)) if alpha else view
+
+
 def check_sizes(sensors: Mapping[str, mi.Sensor]) -> None:
     """Check for equal image sizes of sensors, by name.
 
@@ -98,6 +105,23 @@ def check_sizes(sensors: Mapping[str, mi.Sensor]) -> None:
     for name, other in others:
         if other != size:
             raise MivolError(f'view "{name}" is {other} pixels and view "{first}" {size}: give all views one size.')
+
+
+def has_alpha(sensor: mi.Sensor) -> bool:
+    """Whether the last channel of a sensor's images is their alpha, which a fit does not compare."""
+    return bool(mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha))
+
+
+def drop_alpha(image: mi.TensorXf, sensor: mi.Sensor) -> mi.TensorXf:
+    """The colours of a sensor's image (height, width, channels)."""
+    return image[:, :, :-1] if has_alpha(sensor) else image
+
+
+def add_alpha(adjoint: mi.TensorXf, sensor: mi.Sensor) -> mi.TensorXf:
+    """The adjoint of a sensor's whole image, for the adjoint of its colours: alpha has the adjoint 0."""
+    if not has_alpha(sensor):
+        return adjoint
+    return dr.concat([adjoint, dr.zeros(mi.TensorXf, (*adjoint.shape[:2], 1))], axis=2)
 
 
 def make_single_batches(views: Sequence[View]) -> list[RenderBatch]:
