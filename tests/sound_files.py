@@ -18,6 +18,7 @@ import scipy.io
 import tifffile
 from beamline_files import write_named, write_nxtomo
 from dicom_series import write_frames, write_series
+from dicom_views import write_angiography
 from gaussian_sets import compressed_bytes, in_buckets, inria_bytes, ksplat_bytes, random_gaussians, splat_bytes, spz_bytes
 from photo_sets import write_blender, write_colmap, write_transforms
 from PIL import Image
@@ -71,6 +72,10 @@ def _projections(path: Path) -> None:
 
 def _dicom(path: Path) -> None:
     write_frames(path, numbered()[..., 0].astype("i2"), "axial", [1, 0], [1.0, 2.0])
+
+
+def _dicom_views(path: Path) -> None:
+    write_angiography(path, np.arange(3) * 40.0, (3, 5))
 
 
 def _series(folder: Path) -> None:
@@ -338,6 +343,7 @@ FILES: dict[str, tuple[str, Write, Read]] = {
     "his": (".his", _bytes(his_bytes(np.arange(84).reshape(2, 6, 7))), read_stack),
     "hdf5 by names": (".h5", write_named, lambda path: read_projections(path, names=NAMES)),
     "dicom": (".dcm", _dicom, mivol.read_volume),
+    "dicom views": (".dcm", _dicom_views, lambda path: (draft_scan(path), read_stack(path))),
     "hdf5": (".h5", _hdf5, mivol.read_volume),
     "projections": (".h5", _projections, read_projections),
     "stack": (".tif", lambda path: Image.fromarray(np.eye(8, 9, dtype=np.float32)).save(path), read_stack),

@@ -207,11 +207,16 @@ class Stack(Readings, kw_only=True, tag_field="source", tag="stack"):
     """Projections as images or arrays, with flat and dark fields in other files."""
 
     file: Annotated[
-        str, setting("path", "TIFF, EDF, HIS, MRC, .npy, .npz, HDF5 (views, rows, cols), or a pattern of images", min_length=1)
+        str,
+        setting(
+            "path",
+            "TIFF, EDF, HIS, MRC, .npy, .npz, HDF5 (views, rows, cols), DICOM views, or a pattern of images",
+            min_length=1,
+        ),
     ]
     reading: Annotated[
         Literal["intensity", "transmission", "line_integral"],
-        setting("1", "quantity of a pixel; an intensity needs flats"),
+        setting("1", "quantity of a pixel; an intensity needs flats or light"),
     ]
     images: Annotated[
         Literal["views", "sinograms"],
@@ -220,13 +225,18 @@ class Stack(Readings, kw_only=True, tag_field="source", tag="stack"):
     dataset: Annotated[str, setting("1", "name of the array in an .npz or HDF5 file")] = ""
     flats: Annotated[str, setting("path", "readings of light without object, as file")] = ""
     darks: Annotated[str, setting("path", "readings without light, as file; empty: 0")] = ""
-    angles: Annotated[str, setting("path", "text with one angle per view; empty: evenly over scan.arc")] = ""
+    light: Annotated[float, setting("reading", "of a pixel without object, in place of flats; 0: flats, or none", ge=0)] = 0.0
+    angles: Annotated[str, setting("path", "text with one angle per view, or DICOM views; empty: evenly over scan.arc")] = ""
     angle_unit: Annotated[Literal["degree", "radian"], setting("1", "unit of the angles in the file")] = "degree"
     first_row: Annotated[Literal["lowest", "highest"], setting("1", "row of the detector that the file has first")] = "lowest"
 
     def __post_init__(self) -> None:
-        if (self.reading == "intensity") != bool(self.flats) or (self.darks and not self.flats):
-            raise ValueError("an intensity needs flats, and nothing else takes flats and darks: give flats, or change reading")
+        has_light = bool(self.flats) != bool(self.light)
+        if (self.reading == "intensity") != has_light or (self.darks and not has_light) or (self.flats and self.light):
+            raise ValueError(
+                "an intensity needs flats or light, one of them, and nothing else takes flats, light and darks: give flats, or "
+                "change reading"
+            )
         if self.reading == "intensity" and self.images == "sinograms":
             raise ValueError('sinograms hold corrected values: give reading = "transmission" or "line_integral"')
         if self.reading != "intensity" and self.saturation < INFINITY:

@@ -1,7 +1,7 @@
 """A scan without a TOML file: facts from its files, assumptions, choices, and an equivalent TOML file.
 
-Kinds of scans (``SCAN_KINDS``) are recognised by content: a settings file of a Nikon scanner, an HDF5 file with the layout of a
-scan, a folder with such a file, or a folder of TIFF files without cameras.
+Kinds of scans (``SCAN_KINDS``) are recognised by content: a settings file of a Nikon scanner, DICOM views from several angles,
+an HDF5 file with the layout of a scan, a folder with such a file, or a folder of TIFF files without cameras.
 
 Conventions. Paths in the settings are relative to the working directory. Lengths are in mm if the files tell the size of a
 pixel, in pixels otherwise.
@@ -20,6 +20,7 @@ import numpy as np
 
 from mivol import config
 from mivol.errors import MivolError
+from mivol.files.dicom_views import DicomViews, has_views, read_views, survey_views
 from mivol.files.formats import HEAD, read_volume
 from mivol.files.hdf5 import is_hdf5
 from mivol.files.image_stack import IMAGES, read_images, stack_shape
@@ -88,7 +89,7 @@ def draft_scan(path: Path, changes: Sequence[str] = ()) -> ScanDraft:
         config.apply_change(given, change)
     kind = find_scan(path)
     if kind is None and not (path.is_file() and is_hdf5(path)):
-        kinds = "an .xtekct file, a tilt series (MRC with .rawtlt, .tlt or .mdoc), a sinogram (TIFF)"
+        kinds = "an .xtekct file, DICOM views, a tilt series (MRC with .rawtlt, .tlt or .mdoc), a sinogram (TIFF)"
         expected = f"a scan in HDF5, {kinds}, or a folder of images"
         raise refusal(path, "no scan", expected, "name one of them, or write a TOML file")
     draft = SCAN_KINDS[kind or HDF5][1](path, given)
@@ -254,6 +255,53 @@ def _draft_nikon(path: Path, given: dict[str, Any]) -> ScanDraft:
         raw["grid"], more = _draft_grid(beam, rows, columns)
         lines += more
     return _finish(raw, lines, len(scan.images))
+
+
+# -- DICOM -----------------------------------------------------------------------------------------------------------------
+
+
+def _draft_dicom(path: Path, given: dict[str, Any]) -> ScanDraft:
+    scan = survey_views(path)
+    stack = read_views(path)
+    views, rows, columns = stack.shape
+    lines = [
+        f"found: DICOM, {scan.kind}: {_count(views, 'view')} of {rows} x {columns} pixels of {scan.pitch[0]:.6g} x "
+        f"{scan.pitch[1]:.6g} mm (rows, columns)",
+        f"found: {scan.source_to_axis:.6g} mm from source to axis, {scan.source_to_detector:.6g} mm to the detector",
+        f"found: angles from {scan.angles[0]:.4g} to {scan.angles[-1]:.4g} degrees",
+        *(f"assumed: {line}" for line in scan.assumed),
+    ]
+    reading, why = _guess_light(path, scan, stack)
+    lines.append(f"assumed: {why}: a pixel is taken as {reading['reading']}; data.reading sets it")
+    distances = {"source_to_axis": scan.source_to_axis, "source_to_detector": scan.source_to_detector}
+    beam: dict[str, Any] = {"beam": "cone"} | distances | {"pitch": scan.pitch}
+    if any(scan.detector_offset):
+        beam["detector_offset"] = scan.detector_offset
+        lines.append("found: the detector's middle {:.6g} and {:.6g} mm beside the central ray".format(*scan.detector_offset))
+    data = {"source": "stack", "file": str(path), "angles": str(path)} | reading
+    raw = {"scan": beam, "data": data}
+    return _finish(raw, [*lines, *_put_grid(raw, rows, columns)], views)
+
+
+def _guess_light(path: Path, scan: DicomViews, stack: np.ndarray) -> tuple[dict[str, Any], str]:
+    """Settings of the light of DICOM views (views, rows, columns), and the reason.
+
+    Raises:
+        MivolError: values that are neither light nor line integrals.
+    """
+    if scan.relation.upper() == "LOG" or scan.is_falling:
+        if scan.relation.upper() == "LOG" and scan.is_falling:
+            return {"reading": "line_integral"}, "the header calls the values falling logarithms of the light, up to a factor"
+        found = f"PixelIntensityRelationship {scan.relation or 'empty'}" + ", falling with the light" * scan.is_falling
+        expected = "values in proportion to the light (LIN), or falling logarithms of it (LOG, sign -1)"
+        raise refusal(path, found, expected, "write the views as line integrals in TIFF, and the geometry as [scan]")
+    with suppress(MivolError):
+        return guess_reading(path, stack[len(stack) // 2])
+    brightest = float(f"{stack.max():.6g}")
+    if not brightest > 0:
+        raise refusal(path, f"readings of at most {brightest:g}", "light above 0", "name another series")
+    reason = f"no air at the edges: the brightest reading, {brightest:g}, is the light without object (data.light)"
+    return {"reading": "intensity", "light": brightest}, reason
 
 
 # -- Tilt series ---------------------------------------------------------------------------------------------------------
@@ -470,6 +518,7 @@ def _draft_sinogram(path: Path, given: dict[str, Any]) -> ScanDraft:
 HDF5, TIFF_FOLDER, SINOGRAM = "hdf5", "tiff", "sinogram"
 SCAN_KINDS: dict[str, tuple[Callable[[Path], bool], Callable[[Path, dict[str, Any]], ScanDraft]]] = {
     "nikon": (lambda path: any(map(_is_nikon, path.iterdir() if path.is_dir() else [path])), _draft_nikon),
+    "dicom": (has_views, _draft_dicom),
     HDF5: (lambda path: any(map(is_scan, path.iterdir() if path.is_dir() else [path])), _draft_hdf5),
     "mrc": (_is_tilt_series, _draft_tilt_series),
     TIFF_FOLDER: (lambda path: path.is_dir() and bool(group_images(path, IMAGES)), _draft_tiff),

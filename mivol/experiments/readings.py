@@ -19,6 +19,7 @@ from mivol.config import Detector, Matrices, Measured, Nikon, Stack, Table
 from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.files import read_projections, read_stack
+from mivol.files.dicom_views import has_views, survey_views
 from mivol.files.fetch import resolve_path
 from mivol.files.image_stack import ALL, stack_shape
 from mivol.files.mrc import read_tilt_angles
@@ -134,7 +135,8 @@ def read_stack_scan(settings: config.ScanExperiment, base: Path, rows: slice) ->
     if data.reading == "intensity":
         darks = stack(data.darks) if data.darks else np.zeros((1, *readings.shape[1:]), np.float32)
         notes = () if data.darks else (NO_DARKS,)
-        fields = readings, stack(data.flats), darks
+        flats = stack(data.flats) if data.flats else np.full((1, *readings.shape[1:]), data.light, np.float32)
+        fields = readings, flats, darks
     if fields:
         transmission = correct_transmission(*fields, data.saturation)
     else:
@@ -153,7 +155,8 @@ def read_angles(settings: config.ScanExperiment, base: Path, views: int) -> np.n
         return None
     if not data.angles:
         return even_angles(settings.scan, views)
-    angles = read_tilt_angles(base / data.angles)
+    file = base / data.angles
+    angles = survey_views(file).angles if has_views(file) else read_tilt_angles(file)
     if len(angles) != views:
         raise MivolError(f"{data.angles} has {len(angles)} angles for {views} projections: give one for each.")
     return to_radians(angles, data.angle_unit)

@@ -44,7 +44,7 @@ KEYWORDS = (
     *("ImageOrientationPatient", "ImagePositionPatient", "PixelSpacing", "ImagerPixelSpacing", "SliceThickness"),
     *("SpacingBetweenSlices", "GridFrameOffsetVector", "RescaleSlope", "RescaleIntercept", "DoseGridScaling"),
     *("SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence"),
-    *("PositionerPrimaryAngle", "DistanceSourceToDetector"),
+    *("PositionerPrimaryAngle", "PositionerPrimaryAngleIncrement", "GantryAngle"),
 )
 """Elements of a header that are read."""
 
@@ -84,6 +84,12 @@ def find_dicom(folder: Path) -> Iterator[Path]:
                 yield file
 
 
+def is_dicom_file(path: Path) -> bool:
+    """Whether a file begins as DICOM."""
+    with path.open("rb") as file:
+        return is_dicom(file.read(MAGIC_OFFSET + len(MAGIC)))
+
+
 def read_dicom(path: Path, dataset: str | None = None) -> VolumeData:
     """Read the series in a folder, or the series to which a file belongs.
 
@@ -95,11 +101,11 @@ def read_dicom(path: Path, dataset: str | None = None) -> VolumeData:
     Raises:
         MivolError: no pydicom, damaged files, several series, gaps, two slices in one place, or colours.
     """
-    dcmread = _import_dcmread(path)
+    dcmread = import_dcmread(path)
     if path.is_file():
         check_file(path)
     headers = {file: _read_header(dcmread, file) for file in (find_dicom(path) if path.is_dir() else [path])}
-    if path.is_file() and ("Rows" not in headers[path] or dataset is not None or _frames(headers[path], path) == 1):
+    if path.is_file() and ("Rows" not in headers[path] or dataset is not None or frame_count(headers[path], path) == 1):
         headers |= {file: _read_header(dcmread, file) for file in find_dicom(path.parent) if file != path}
         if dataset is None:
             uid = headers[path].get("SeriesInstanceUID")
@@ -140,14 +146,18 @@ def read_dicom(path: Path, dataset: str | None = None) -> VolumeData:
 
 def _refuse_views(path: Path, headers: list[Any]) -> None:
     """Refuse views of a turning source, which are no slices."""
-    views = [one for one in headers if "PositionerPrimaryAngle" in one and "DistanceSourceToDetector" in one]
-    angles = {str(one.PositionerPrimaryAngle) for one in views}
-    if len(angles) > 1 or any(int(one.get("NumberOfFrames") or 1) > 1 for one in views):
-        found = f"views of a source {views[0].DistanceSourceToDetector} mm from its detector, from {len(angles)} angles"
-        raise refusal(path, found, "slices", 'write the views as TIFF, and their geometry as [scan] with beam = "cone"')
+    angles = set()
+    for one in headers:
+        for frame in one.get("PerFrameFunctionalGroupsSequence") or [one]:
+            place = frame.get("PositionerPositionSequence") or [one]
+            angles |= {str(place[0].get(name)) for name in ("PositionerPrimaryAngle", "GantryAngle") if name in place[0]}
+        angles |= {f"{angle} more" for angle in np.atleast_1d(one.get("PositionerPrimaryAngleIncrement") or []) if angle}
+    if len(angles) > 1:
+        found = f"views of a source from {len(angles)} angles"
+        raise refusal(path, found, "slices", "reconstruct them with mivol optimize (views with a place of a slice: write TIFF)")
 
 
-def _import_dcmread(path: Path) -> Any:
+def import_dcmread(path: Path) -> Any:
     try:
         from pydicom import dcmread
     except ImportError as error:
@@ -157,7 +167,7 @@ def _import_dcmread(path: Path) -> Any:
 
 
 @contextmanager
-def _guarded(file: Path) -> Iterator[None]:
+def guarded(file: Path) -> Iterator[None]:
     """Refuse what pydicom cannot read: its parsers and decoders raise errors of many classes."""
     try:
         with warnings.catch_warnings():
@@ -171,7 +181,7 @@ def _guarded(file: Path) -> Iterator[None]:
 
 
 def _read_header(dcmread: Any, file: Path) -> Any:
-    with _guarded(file):
+    with guarded(file):
         header = dcmread(file, stop_before_pixels=True, specific_tags=list(KEYWORDS))
         # pydicom converts an element when it is asked for it first.
         for keyword in KEYWORDS:
@@ -179,9 +189,9 @@ def _read_header(dcmread: Any, file: Path) -> Any:
         return header
 
 
-def _frames(header: Any, file: Path) -> int:
+def frame_count(header: Any, file: Path) -> int:
     """Number of frames, at most as many as the file has bits: a frame takes one at least, packed or not."""
-    with _guarded(file):
+    with guarded(file):
         frames, most = int(header.get("NumberOfFrames") or 1), 8 * file.stat().st_size
         if not 1 <= frames <= most:
             raise refusal(file, f"{frames} frames", f"1 to {most} in a file of this size", "correct the header")
@@ -217,7 +227,7 @@ def _name_series(series: dict[str, dict[Path, Any]]) -> dict[str, str]:
 
 
 def _list_slices(file: Path, header: Any) -> list[Slice]:
-    with _guarded(file):
+    with guarded(file):
         kind = str(header.get("PhotometricInterpretation", "MONOCHROME2"))
         if int(header.get("SamplesPerPixel") or 1) != 1 or not kind.startswith("MONOCHROME"):
             raise refusal(file, f"colours ({kind})", "grey values (MONOCHROME1 or 2)", "name a series of grey values")
@@ -225,7 +235,7 @@ def _list_slices(file: Path, header: Any) -> list[Slice]:
             raise refusal(
                 file, "values by a lookup table", "a slope and an intercept", "convert it to .nrrd by another program"
             )
-        slices = [_make_slice(file, header, frame) for frame in range(_frames(header, file))]
+        slices = [_make_slice(file, header, frame) for frame in range(frame_count(header, file))]
         offsets = header.get("GridFrameOffsetVector")
         if offsets is not None and len(slices) > 1 and slices[0].axes is not None and slices[0].position is not None:
             ahead = [np.cross(*one.axes) * float(offsets[one.frame]) for one in slices]
@@ -368,7 +378,7 @@ def _read_values(dcmread: Any, path: Path, slices: list[Slice]) -> tuple[np.ndar
         frames.setdefault(one.file, []).append((k, one))
     dtype = ""
     for file, parts in frames.items():
-        stored = _decode(dcmread, file).reshape(-1, rows, columns)
+        stored = decode(dcmread, file).reshape(-1, rows, columns)
         dtype = str(stored.dtype)
         for k, one in parts:
             frame = stored[one.frame]
@@ -376,8 +386,8 @@ def _read_values(dcmread: Any, path: Path, slices: list[Slice]) -> tuple[np.ndar
     return values, dtype
 
 
-def _decode(dcmread: Any, file: Path) -> np.ndarray:
-    with _guarded(file):
+def decode(dcmread: Any, file: Path) -> np.ndarray:
+    with guarded(file):
         image = dcmread(file)
         try:
             return image.pixel_array

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from mivol.files import source
+from mivol.files.dicom_views import has_views, read_views, survey_views
 from mivol.files.formats import read_volume
 from mivol.files.source import check_file, refusal
 from mivol.files.tiff import TIFF, natural_order
@@ -37,7 +38,8 @@ def read_stack(path: str | os.PathLike, dataset: str | None = None, rows: slice 
     """Read projections.
 
     Args:
-        path: TIFF, EDF, HIS, MRC, .npy, .npz or HDF5 file, or a pattern of TIFF, EDF or HIS files.
+        path: TIFF, EDF, HIS, MRC, .npy, .npz or HDF5 file, a pattern of TIFF, EDF or HIS files, or DICOM views (a file, or the
+            folder of a file a view), which have their lowest row first.
         dataset: name of the array in an .npz or HDF5 file.
         rows: rows of the images. Other rows are not read from uncompressed TIFF and ``.npy``.
 
@@ -47,6 +49,8 @@ def read_stack(path: str | os.PathLike, dataset: str | None = None, rows: slice 
     Raises:
         MivolError: no file, another format, images of different sizes, or numbers that are not finite.
     """
+    if has_views(Path(path)):
+        return read_views(path, rows)
     files = _find_files(path)
     if files[0].suffix.lower() in IMAGES:
         stack = read_images(files, rows)
@@ -63,6 +67,9 @@ def stack_shape(path: str | os.PathLike, dataset: str | None = None) -> tuple[in
 
     Args, raises: as :func:`read_stack`.
     """
+    if has_views(Path(path)):
+        views = survey_views(path)
+        return len(views.frames), *views.pixels
     files = _find_files(path)
     if files[0].suffix.lower() in DETECTOR_IMAGES:
         frames = _read_detector_images(files[0])
