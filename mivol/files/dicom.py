@@ -158,6 +158,11 @@ def _refuse_views(path: Path, headers: list[Any]) -> None:
 
 
 def import_dcmread(path: Path) -> Any:
+    """The reader of pydicom.
+
+    Raises:
+        MivolError: no pydicom.
+    """
     try:
         from pydicom import dcmread
     except ImportError as error:
@@ -387,6 +392,11 @@ def _read_values(dcmread: Any, path: Path, slices: list[Slice]) -> tuple[np.ndar
 
 
 def decode(dcmread: Any, file: Path) -> np.ndarray:
+    """The stored pixels of a file, (rows, columns) or (frames, rows, columns).
+
+    Raises:
+        MivolError: a damaged file, or a compression without its decoder.
+    """
     with guarded(file):
         image = dcmread(file)
         try:
