@@ -77,7 +77,7 @@ def whole_file(path: str | os.PathLike) -> Iterator[Path]:
             _sync_folder(target.parent)
     finally:
         with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
+            temporary.unlink()
 
 
 def write_whole(path: str | os.PathLike, writer: Callable[[BinaryIO], object]) -> None:

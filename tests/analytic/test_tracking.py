@@ -201,6 +201,17 @@ def test_one_grid_beside_fog_is_estimated():
     assert np.abs(estimated - exact).max() > 1e-3 * exact.max()
 
 
+def test_estimated_shadows_see_the_area_of_microflakes():
+    """Nothing varies in a block of one value, so the estimate is the exact shadow, also of flakes of area 0.6 to 1."""
+    flakes = np.array([1, 0.36, 0.64, 0, 0, 0], np.float32).reshape(1, 1, 1, 6)
+    cube = smoke(np.full((4, 4, 4, 1), 0.7, np.float32))[0]
+    cube["interior"]["phase"] = {"type": "sggx", "S": {"type": "gridvolume", "grid": mi.VolumeGrid(flakes), "raw": True}}
+    scene = close_up({"smoke": cube, "sun": sun([0.3, 0.2, -1.0])[0]}, res=4)
+    exact, estimated = (scenes.render(scene, mivol(shadows=shadows), 4, seed=1) for shadows in ("exact", "estimated"))
+    # Optical depths of order 1 in 30 float32 steps.
+    np.testing.assert_allclose(estimated, exact, rtol=1e-5)
+
+
 def test_words_for_shadows():
     scene = close_up({"smoke": smoke(rough_grid(1))[0], "sky": scenes.sky(0.3)}, res=4)
     with refused("auto, exact, estimated or grid"):

@@ -1,4 +1,4 @@
-"""Figures of the benches, drawn from made-up answers, are readable."""
+"""Figures of the benches, drawn from made-up answers, are readable; tables hold the numbers of made-up answers."""
 
 from __future__ import annotations
 
@@ -11,14 +11,20 @@ from bench_figures import drawn
 from readable_figures import assert_readable
 
 from mivol.bench.studies import (
+    cluster,
+    conversions,
     depth,
+    gpu,
     gradients,
     media_light,
     multiple_scattering,
     optical_depth,
+    preparation,
     radiance_field,
     random_scenes,
+    representations,
     single_scattering,
+    steps,
     tomography,
 )
 from mivol.bench.studies.depth import TABLES
@@ -117,3 +123,89 @@ def test_optical_depth(monkeypatch: pytest.MonkeyPatch) -> None:
         "error": "RMS error of T against float64",
         "title": "Transmittance of 12,345 rays through the smoke 128^3: error against time",
     }
+
+
+CLUSTER = {
+    "reference": {"ratio": 0.61, "workers": 1.1, "uneven": 1.02, "owner": 0.03},
+    "gradient": {"ratio": 0.64},
+    "messages": {"seconds": {"8e4": {"median": 0.0031, "fastest": 0.0027}}, "latency": 0.0012, "bandwidth": 2.5e8},
+    "scaling": [{"name": "a fit", "seconds": [4.0, 2.125], "limit": "2 workers: no more units"}],
+}
+AXES = {
+    "scans": {"head": {"column": 59.8, "error": -0.0312, "sigma": 0.0204, "method": "mirror"}},
+    "count": 1,
+    "found": 1,
+    "found_or_told": 1,
+}
+STEP = {"milliseconds": {"prbvolpath": 20.0, "mivol": 4.0}, "launches": {"prbvolpath": 61, "mivol": 8}, "ratio": 5.0}
+TARGETS = {"octree": {"loss": 38.26, "psnr": 33.04}}
+TABLES_OF = [
+    (cluster, "overhead", {"7": {"median": 0.012, "fastest": 0.0081, "processor": 0.0064}}, [
+        "a step of 100 ms with 7 reals takes 12 ms more (median; fastest 8.1 ms; processor time of owner and worker 6.4 ms)",
+    ]),
+    (cluster, "cluster", CLUSTER, [
+        "reference: two workers take 0.610 of the time of one process",
+        "gradient: two workers take 0.640 of the time of one process",
+        "reference: the workers take 1.100 of the time of one process together, the slower one 1.020 of their mean, and the "
+        "owner 0.030",
+        "8e4 bytes to two workers and back: median 3.1 ms, fastest 2.7 ms",
+        "latency 1.2 ms a worker, bandwidth 250 MB/s",
+        "",
+        "| workload | 1 | 2 | 4 | 8 | 16 | 32 | 100 | 1000 | fastest |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+        "| a fit | 4 | 2.12 | 2 workers: no more units |",
+    ]),
+    (conversions, "matrix", {"sources": {"grid": {"psnr": 34.1, "targets": TARGETS}}}, [
+        "| from, to | grid | octree | hash grid | NeRF | Gaussians |",
+        "|---|---|---|---|---|---|",
+        "| grid (34.1) | - | 38.3 (33.0) | - | - | - |",
+    ]),
+    (gpu, "samples", {"samples_per_second": 2.5e7, "card": "a card"}, [
+        "| hash grid, forward and backward | 25.0 M samples/s | a card |",
+    ]),
+    (gpu, "hash", {"psnr": 30.126, "ssim": 0.9, "seconds": 61.2, "card": "a card"}, [
+        "| hash | 30.13 dB / 0.900 in 61 s | a card |",
+    ]),
+    (gpu, "hash", {}, []),
+    (preparation, "axis", AXES, [
+        "| scan | column | error | sigma | method |",
+        "| --- | --- | --- | --- | --- |",
+        "| head | 59.8 | -0.031 | 0.020 | mirror |",
+        "",
+        "within 0.2 columns: 1 of 1; or within two sigma: 1",
+    ]),
+    (preparation, "rings", {"head": {"none": 2.0, "gain": 1.0625}}, [
+        "| scan | none | gain |",
+        "| --- | ---: | ---: |",
+        "| head | 2 | 1.06 |",
+    ]),
+    (representations, "rounds", {"32 + 32": {"psnr": 20.904, "ssim": 0.7, "steps": 512}}, [
+        "| samples of a ray | PSNR / SSIM | steps |",
+        "|---|---|---|",
+        "| 32 + 32 | 20.90 dB / 0.700 | 512 |",
+    ]),
+    (representations, "samples", {"rate": 1.0}, []),
+    (steps, "gradients", {"rows": {"a": STEP, "b": {"milliseconds": {"mivol": 1.5}, "launches": {"mivol": 3}}}}, [
+        "| scene, film | prbvolpath [ms] | mivol [ms] | ratio | launches |",
+        "|---|---|---|---|---|",
+        "| a | 20 | 4 | 5 | 61 / 8 |",
+        "| b | | 1.5 | | 3 |",
+    ]),
+]  # fmt: skip
+"""Study, question, answer, lines."""
+
+
+@pytest.mark.parametrize(("study", "question", "answer", "lines"), TABLES_OF)
+def test_tables_hold_their_numbers(study: ModuleType, question: str, answer: dict, lines: list[str]) -> None:
+    assert study.STUDY.table(question, answer) == lines
+
+
+def test_a_fit_that_was_not_made_has_no_figure() -> None:
+    gpu.STUDY.draw({"hash": {}}, Path("nothing"))
+
+
+def test_axes_count_as_found_or_told() -> None:
+    """Within 0.2 columns, or within two standard deviations."""
+    rows = {k: {"error": e, "sigma": s} for k, (e, s) in enumerate([(-0.19, 0), (0.2, 0), (-0.39, 0.2), (0.39, 0.19)])}
+    answer = preparation.join_axes(preparation.PreparationSize(), rows)
+    assert (answer["count"], answer["found"], answer["found_or_told"]) == (4, 1, 2)

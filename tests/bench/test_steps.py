@@ -50,7 +50,6 @@ def test_a_study_counts_and_compares(tmp_path: Path) -> None:
     assert row["ratio"] == answer["least_ratio"] > 0 and row["milliseconds"]["mivol"] > 0
     # A replay of three kernels: the image, the light again, and its derivatives, with their fills and sums.
     assert 0 < row["launches"]["mivol"] < 250
-    assert len(study.table("gradients", answer)) == 3
     study.draw({"gradients": answer}, tmp_path / "steps.png")
     assert (tmp_path / "steps.png").stat().st_size > 1000
     (bar,) = study.compare("gradients", {"least_ratio": 0.9})

@@ -527,6 +527,8 @@ def test_citations_are_complete_and_unique():
     for key, source in CITATIONS.items():
         assert source.authors and source.title and source.where and 1700 < source.year < 2100, key
         assert source.link == "" or source.link.startswith("https://"), key
+        years = [int(word) for word in key.split("_") if word.isdecimal()]
+        assert years in ([], [source.year]), key
     assert [source.year for source in list_citations(["novak_2018", "kak_1988", "novak_2018"])] == [2018, 1988]
     with pytest.raises(MivolError, match="use kingma_2015"):
         list_citations(["kingma_2014"])

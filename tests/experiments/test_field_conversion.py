@@ -148,7 +148,7 @@ def test_conversions_without_a_meaning_are_refused(
 
 @pytest.mark.parametrize("nodes", [13, 40])
 def test_voxels_far_from_matter_are_not_sampled(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, nodes: int) -> None:
-    """Coarser and finer than the levels, the voxels near matter are all that hold matter."""
+    """Coarser and finer than the levels, the voxels near matter are all that hold matter; both are as symmetric."""
     density, sh = ball(12).to_dense()
     outer = replace(SphericalGrid.from_dense(np.roll(density, 4, axis=0), sh, CUBE), to_world=ball(12).level_to_world(1))
     field = SphericalGrid.from_levels([ball(12), outer])
@@ -158,3 +158,6 @@ def test_voxels_far_from_matter_are_not_sampled(variant_rgb: str, monkeypatch: p
     monkeypatch.setattr(resampling, "_nodes_near_matter", lambda *_: np.arange(np.prod(res)))
     np.testing.assert_array_equal(found, resampling.sample_voxels(field, res, place)[0])
     assert len(near) < 0.9 * np.prod(res)
+    is_near = np.isin(np.arange(np.prod(res)), near).reshape(res)
+    for axis in (1, 2):
+        np.testing.assert_array_equal(is_near, np.flip(is_near, axis))

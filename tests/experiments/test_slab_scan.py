@@ -73,6 +73,7 @@ def test_the_preview_reads_a_few_rows_at_once(variant_rgb: str, tmp_path: Path, 
     """Half of a memory of 12 rows beyond the base: six rows at once, the same line integrals as of all rows."""
     (tmp_path / "fit.toml").write_text(SCAN + PARALLEL + ROWS)
     plan = plan_slabs(config.load(tmp_path / "fit.toml", []), tmp_path)
+    assert plan.choices[-1].choice == "1 slab of 24 layers"
     row = slab_scan.RAY_BYTES["direct"] * 40 * 24
     monkeypatch.setattr(slab_scan, "BASE_BYTES", 2**30 - 12 * row)
     read, views, counts = plan.source.read, np.arange(0, 40, 3), []
@@ -198,6 +199,7 @@ def test_memory_bounds_the_slabs(variant_rgb: str, tmp_path: Path) -> None:
         plan = plan_slabs(config.load(tmp_path / "fit.toml", [f"slabs.memory={memory}"]), tmp_path)
         counts[memory] = plan.layers[0].stop
         assert plan.layers[-1].stop == 1024 and counts[memory] % 16 == 0
+        assert plan.choices[-1].choice == f"{len(plan.layers)} slabs of {counts[memory]} layers"
     assert counts[4.0] >= 2 * counts[2.0] > 0
     with pytest.raises(MivolError, match=r"a slab of one layer needs 0\.41 GiB, found slabs.memory = 0\.35: set it to 0\.5"):
         plan_slabs(config.load(tmp_path / "fit.toml", ["slabs.memory=0.35"]), tmp_path)

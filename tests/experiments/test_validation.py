@@ -62,6 +62,8 @@ def test_the_picture_shows_what_was_judged(variant_rgb, scene: Path, monkeypatch
     ((reference, image, z),) = drawn
     np.testing.assert_array_equal(z, verdict.comparison.z)
     assert reference.shape == image.shape == z.shape
+    floor = 0.01 * np.mean(reference**2)
+    assert verdict.rel_mse == pytest.approx(np.mean((image - reference) ** 2 / (reference**2 + floor)), rel=1e-6)
 
 
 @pytest.mark.slow
