@@ -12,6 +12,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -34,7 +35,6 @@ from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.octree_problem import OctreeProblem
-from mivol.optim.photographs.radiance_plan import RadiancePlan
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.sampled_problem import SampledProblem
 from mivol.photos import Photo, Photos, rectify
@@ -152,7 +152,12 @@ class PhotoProblem:
 
 
 def prepare_fit(
-    folder: Path, photos: dict, settings: dict, seed: int = 0, adapt: Callable[[RadiancePlan], RadiancePlan] = lambda plan: plan
+    folder: Path,
+    photos: dict,
+    settings: dict,
+    seed: int = 0,
+    adapt: Callable[[Any], Any] = lambda plan: plan,
+    change: Callable[[Photos], Photos] = lambda photos: photos,
 ) -> PhotoProblem:
     """Read photographs and prepare their fit.
 
@@ -161,12 +166,13 @@ def prepare_fit(
         photos: settings of the table ``photos``, besides the path.
         settings: the table ``field`` or ``gaussians``, by its name.
         seed: seed of the fit.
-        adapt: changes the plan of a grid.
+        adapt: changes the plan of a grid or of Gaussians, before it is adapted to the photographs.
+        change: changes the photographs to fit, or their box.
     """
     tables = {"title": folder.name, "seed": seed, "photos": {"path": str(folder), **photos}, **settings}
     chosen = config.from_dict(tables)
     train, judged = read_photos(chosen, Path())
-    train = add_box(chosen, train)
+    train = change(add_box(chosen, train))
     if isinstance(chosen, config.FieldExperiment):
         plan = adapt_plan(adapt(make_plan(chosen)), train)
         problem = RadianceProblem(make_batches(plan, train), train.box, plan)
@@ -177,7 +183,7 @@ def prepare_fit(
     if isinstance(chosen, config.HashExperiment | config.NerfExperiment):
         problem = make_sampled_problem(make_sampled_plan(chosen), train, seed)
         return PhotoProblem(problem, train, judged, problem.plan.steps)
-    begun = start_gaussians(chosen, train, make_gaussian_plan(chosen))
+    begun = start_gaussians(chosen, train, adapt(make_gaussian_plan(chosen)))
     return PhotoProblem(begun.problem(seed), train, judged, begun.plan.steps)
 
 

@@ -111,6 +111,7 @@ class FieldSettings(Section):
     exposure: Annotated[
         bool | None, setting("1", "gains of each photograph, dropped if they agree; absent: preset (only capture)")
     ] = None
+    poses: Annotated[bool, setting("1", "cameras move with the fit, for poses that are off by a pixel or more")] = False
     beta: Annotated[float, setting("1", "favours rays of opacity 0 or 1; absent: preset", ge=0)] | None = None
 
     def __post_init__(self) -> None:

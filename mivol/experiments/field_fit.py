@@ -18,7 +18,7 @@ from mivol.config import FieldExperiment
 from mivol.errors import MivolError
 from mivol.experiments.fit_kind import Say
 from mivol.experiments.photo_data import LEARNED
-from mivol.experiments.photo_fit import PhotoFit, describe_free_space
+from mivol.experiments.photo_fit import MOTIONS, PhotoFit, describe_free_space
 from mivol.experiments.run_folder import BestFiles, RunFolder
 from mivol.fields.field_files import write_field
 from mivol.fields.sky import Sky
@@ -106,6 +106,9 @@ class FieldFit(PhotoFit):
 
     def gains(self) -> NDArray | None:
         return self.problem.exposure.table() if self.problem.has_gains else None
+
+    def motions(self) -> NDArray | None:
+        return None if self.problem.poses is None else self.problem.poses.table()
 
     def write_first_view(self, run: RunFolder, view: FieldView, photo: Photo) -> list[Image]:
         return write_geometry(run.path, view, photo.camera, self.judged.near_far)
@@ -213,7 +216,7 @@ def make_plan(settings: FieldExperiment) -> RadiancePlan:
     if options.preset not in PRESETS:
         raise MivolError(f'field.preset = "{options.preset}" is unknown: {suggest_name(options.preset, list(PRESETS))}')
     plan = set_background(PRESETS[options.preset], settings.photos.background)
-    names = ("degree", "first_degree", "tv_density", "tv_sh", "sparsity", "matte", "depth", "sky", "beta", "exposure")
+    names = ("degree", "first_degree", "tv_density", "tv_sh", "sparsity", "matte", "depth", "sky", "beta", "exposure", "poses")
     given = {name: getattr(options, name) for name in names}
     plan = replace(plan, **{name: value for name, value in given.items() if value is not None})
     stages = [replace(stage, steps=max(1, round(stage.steps * options.effort))) for stage in plan.stages]
@@ -326,6 +329,7 @@ def explain_plan(plan: RadiancePlan, photos: Photos, batches: RayBatches) -> lis
         explain_degree(plan, len(photos.views)),
         explain_background(plan, photos),
         *[GAINS][: plan.exposure],
+        *[MOTIONS][: plan.poses],
         PlanLine(choice=f"rays end at a transmittance of {plan.stop:g}", reason="largest neglected share of the light"),
         PlanLine(choice=check_memory(plan, box, batches), reason="estimated before the allocation"),
     ]

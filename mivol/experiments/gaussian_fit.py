@@ -23,7 +23,7 @@ from scipy.special import logit
 from mivol.config import GaussianExperiment
 from mivol.errors import MivolError
 from mivol.experiments.fit_kind import Stages
-from mivol.experiments.photo_fit import PhotoFit, describe_free_space
+from mivol.experiments.photo_fit import MOTIONS, PhotoFit, describe_free_space
 from mivol.experiments.run_folder import BestFiles, RunFolder
 from mivol.optim.gaussians.density_control import CloudArrays
 from mivol.optim.gaussians.gaussian_plan import CONTROLS, PRESETS, GaussianPlan, check_memory, scene_extent
@@ -56,11 +56,6 @@ class GaussianFit(PhotoFit):
     def fits_colours(self) -> bool:
         """Whether the photographs have gains."""
         return self.problem.exposure is not None
-
-    @property
-    def refines_poses(self) -> bool:
-        """Whether the fit moves cameras."""
-        return self.problem.motions is not None
 
     def make_plan(self, settings: GaussianExperiment) -> GaussianPlan:
         return make_gaussian_plan(settings)
@@ -106,13 +101,13 @@ class GaussianFit(PhotoFit):
         path = run.path / FILE
         gaussians = self.write_gaussians(path)
         self.record.tables = [tabulate_gaussians(gaussians, path.stat().st_size)]
-        if self.refines_poses:
-            names = [view.name for view in self.photos.views]
-            self.record.tables.append(tabulate_motions(names, self.problem.motions, self.problem.extent))
         return {"gaussians": float(gaussians.count)}
 
     def gains(self) -> NDArray | None:
         return None if self.problem.exposure is None else self.problem.exposure.table()
+
+    def motions(self) -> NDArray | None:
+        return None if self.problem.motions is None else self.problem.motions * ([1] * 3 + [self.problem.extent] * 3)
 
 
 def judge_view(problem: GaussianProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]) -> tuple[NDArray, ImageScore]:
@@ -141,21 +136,6 @@ def tabulate_gaussians(gaussians: Gaussians, bytes_: int) -> Table:
         ("longest over shortest axis: median", f"{np.median(scale.max(axis=1) / scale.min(axis=1)):.3g}"),
     )
     return Table(title="Fitted Gaussians", head=("", ""), rows=rows)
-
-
-def tabulate_motions(names: Sequence[str], motions: NDArray, extent: float) -> Table:
-    """Table of the motions of the photographs' cameras, the farthest turn first.
-
-    Args:
-        names: of the photographs.
-        motions: (photographs, 6) as :attr:`mivol.optim.gaussians.gaussian_problem.GaussianProblem.motions`.
-        extent: unit of the translations [length].
-    """
-    turns, shifts = np.degrees(np.linalg.norm(motions[:, :3], axis=1)), np.linalg.norm(motions[:, 3:], axis=1) * extent
-    rows = [(names[k], f"{turns[k]:.3f}", f"{shifts[k]:.3g}") for k in np.argsort(-turns, kind="stable")]
-    return Table(
-        title="Motions of the cameras in the fit", head=("photograph", "turn [degree]", "shift [length]"), rows=tuple(rows)
-    )
 
 
 @dataclass(frozen=True)
@@ -241,10 +221,6 @@ def adapt_to_few(plan: GaussianPlan, photographs: int) -> GaussianPlan:
 
 
 GAINS = PlanLine(choice="gains of each photograph", reason="for cameras with automatic exposure; with a prior towards 1")
-MOTIONS = PlanLine(
-    choice="cameras move with the fit",
-    reason="for poses that are off by a pixel or more; held-out photographs are judged as they are, and after an alignment",
-)
 
 
 def explain_plan(plan: GaussianPlan, photos: Photos, count: int, whence: str, memory: str, minutes: float) -> list[PlanLine]:

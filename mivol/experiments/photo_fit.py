@@ -187,6 +187,12 @@ def describe_free_space(cameras: Sequence[Camera], reach: float) -> PlanLine:
     )
 
 
+MOTIONS = PlanLine(
+    choice="cameras move with the fit",
+    reason="for poses that are off by a pixel or more; held-out photographs are judged as they are, and after an alignment",
+)
+
+
 def rename_metrics(values: dict[str, float]) -> dict[str, float]:
     """Metrics by the names of :data:`mivol.report.record.QUANTITIES`."""
     return {("held_out_psnr" if name == "psnr" else name): value for name, value in values.items()}
@@ -202,13 +208,11 @@ class PhotoFit(FitKind):
         film: cameras of the film.
         levels: nested boxes of the model.
         fits_colours: whether judged views also have a PSNR with their colours fitted to the photographs'.
-        refines_poses: whether the fit moves cameras; judged views then also have a PSNR with their own poses aligned.
     """
 
     stages = Stages("photographs", "fit", "images and volumes")
     levels: int = 1
     fits_colours: bool
-    refines_poses: bool = False
     plan: Any
     settings: PhotoExperiment
 
@@ -304,6 +308,13 @@ class PhotoFit(FitKind):
     def gains(self) -> NDArray | None:
         """Return the fitted gains of the photographs (photographs, 3); None without gains."""
 
+    def motions(self) -> NDArray | None:
+        """Return the motions of the cameras in the fit (photographs, 6): rotation vectors about their positions, in the axes of
+        the world [rad], and translations [length]; None for cameras that stay. Judged views then also have a PSNR with their
+        own poses aligned.
+        """
+        return None
+
     def rectified(self, photo: Photo) -> Photo:
         """Return the photograph to compare with a view of the model."""
         return photo
@@ -319,6 +330,9 @@ class PhotoFit(FitKind):
         gains = self.gains()
         if gains is not None:
             record.tables.append(tabulate_gains([view.name for view in self.photos.views], gains))
+        motions = self.motions()
+        if motions is not None:
+            record.tables.append(tabulate_motions([view.name for view in self.photos.views], motions))
         record.results = {"views": float(len(self.photos.views)), "iterations": float(fit.next_iteration), **sizes}
         if self.judged is not None:
             record.results |= self.write_judged(run)
@@ -330,7 +344,7 @@ class PhotoFit(FitKind):
     def write_judged(self, run: RunFolder) -> dict[str, float]:
         """Judge all views, and write the views beside the photographs; return the means of the metrics."""
         views, space, show = self.judged.views, self.judged.space, self.settings.show
-        qualities, fitted, aligned, first = [], [], [], []
+        qualities, fitted, aligned, first, refines_poses = [], [], [], [], self.motions() is not None
         pictures = JudgedViews(run.path, space, len(views), show.views)
         for number, photo in enumerate(views):
             photo = self.rectified(photo)
@@ -339,7 +353,7 @@ class PhotoFit(FitKind):
             qualities.append(quality)
             if self.fits_colours:
                 fitted.append(judge_colour_fitted(image, photo, space))
-            if self.refines_poses:
+            if refines_poses:
                 aligned.append(self.judge(self.align(photo), ("psnr",))[1].values["psnr"])
             psnr = quality.values.get("psnr", fitted[-1] if fitted else next(iter(quality.values.values())))
             pictures.add(photo, image, psnr, describe_quality(quality, fitted[-1] if fitted else None))
@@ -379,3 +393,12 @@ def tabulate_gains(names: Sequence[str], gains: NDArray) -> Table:
     rows = [(names[k], *(f"{gain:.3f}" for gain in gains[k])) for k in far]
     head = ("photograph", "red", "green", "blue")
     return Table(title="Gains of the photographs: exposure and white balance", head=head, rows=tuple(rows))
+
+
+def tabulate_motions(names: Sequence[str], motions: NDArray) -> Table:
+    """Table of the motions of the photographs' cameras (:meth:`PhotoFit.motions`), the farthest turn first."""
+    turns, shifts = np.degrees(np.linalg.norm(motions[:, :3], axis=1)), np.linalg.norm(motions[:, 3:], axis=1)
+    rows = [(names[k], f"{turns[k]:.3f}", f"{shifts[k]:.3g}") for k in np.argsort(-turns, kind="stable")]
+    return Table(
+        title="Motions of the cameras in the fit", head=("photograph", "turn [degree]", "shift [length]"), rows=tuple(rows)
+    )

@@ -177,6 +177,19 @@ class UpdateOccupancy(Event, tag="update_occupancy"):
         return ""
 
 
+class AlignCameras(Event, tag="align_cameras"):
+    """Let a problem move the cameras of its photographs to where its model agrees better with them."""
+
+    every: Annotated[int, setting("iteration", "interval between events", ge=1)] = 25
+
+    def due(self, iteration: int) -> bool:
+        return iteration > 0 and iteration % self.every == 0
+
+    def apply(self, fit: RunningFit) -> str:
+        fit.problem.set_reals(fit.run.reals)
+        return fit.problem.align_cameras(fit.next_iteration)
+
+
 class ControlDensity(Event, tag="control_density"):
     """Let a problem add Gaussians to poorly fitted regions and remove invisible Gaussians."""
 

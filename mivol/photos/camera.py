@@ -8,6 +8,7 @@ centre at (j + 1/2, i + 1/2). ``K`` is OpenCV's matrix in these coordinates, wit
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -222,24 +223,76 @@ def _check_pose(matrix: np.ndarray, K: np.ndarray, size: tuple[int, int], name: 
 # -- Correction of a pose ----------------------------------------------------------------------------------------------------
 
 
+MOTION = 6
+"""Numbers of a motion."""
+
 ALIGNMENT_ITERATIONS = 4
 """Iterations of an alignment: seven renders each."""
 
-MOTION_STEP = 0.5
+DIFFERENCE = 0.5
 """Difference of a motion for derivatives [pixel]."""
 
 DAMPING = 0.01, 0.1, 10.0
 """First damping, relative to the diagonal, and its factors after a better and a worse step."""
 
 
+@dataclass(frozen=True)
+class Motions:
+    """Motions of some cameras, searched by least squares: six numbers each, a rotation about the camera's position and a
+    translation, in the axes of the world. Each is in a unit that moves the image of the subject by about a pixel
+    (:func:`motion_unit`).
+
+    Source: Levenberg 1944, Marquardt 1963 (damped least squares); derivatives are differences of renders.
+
+    Attributes:
+        motion: (cameras, 6) [pixel].
+        damping: (cameras,) of the next step, relative to the diagonal of its equations.
+    """
+
+    motion: np.ndarray
+    damping: np.ndarray
+
+    @classmethod
+    def none(cls, cameras: int) -> Motions:
+        """No motion yet."""
+        return cls(np.zeros((cameras, MOTION)), np.full(cameras, DAMPING[0]))
+
+    def improve(self, error: Callable[[np.ndarray], np.ndarray], expected: float = math.inf) -> Motions:
+        """The motions after one damped step of each camera; a step that does not lower its error is not taken.
+
+        Args:
+            error: differences of renders and photographs (cameras, n) at motions (cameras, 6). It is called eight times, each
+                time for all cameras, which share no differences.
+            expected: standard deviation of each number of a motion, for a prior [pixel].
+        """
+        residual = error(self.motion)
+        weight = (residual**2).mean(axis=1) / expected**2
+
+        def cost(differences: np.ndarray, motion: np.ndarray) -> np.ndarray:
+            return (differences**2).sum(axis=1) + weight * (motion**2).sum(axis=1)
+
+        slopes = np.stack([(error(self.motion + DIFFERENCE * axis) - residual) / DIFFERENCE for axis in np.eye(MOTION)], axis=2)
+        normal = np.einsum("cni,cnj->cij", slopes, slopes) + weight[:, None, None] * np.eye(MOTION)
+        trace = np.trace(normal, axis1=1, axis2=2)
+        floor = np.where(trace > 0, 1e-6 * trace, 1.0)  # a model that shows nothing to a camera does not move the camera
+        diagonal = np.maximum(np.diagonal(normal, axis1=1, axis2=2), floor[:, None])
+        damped = normal + (self.damping[:, None] * diagonal)[:, :, None] * np.eye(MOTION)
+        gradient = np.einsum("cni,cn->ci", slopes, residual) + weight[:, None] * self.motion
+        tried = self.motion - np.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
+        is_better = cost(error(tried), tried) < cost(residual, self.motion)
+        factor = np.where(is_better, DAMPING[1], DAMPING[2])
+        return Motions(np.where(is_better[:, None], tried, self.motion), self.damping * factor)
+
+
+def motion_unit(camera: Camera, distance: float) -> np.ndarray:
+    """Rotations [rad] and translations [length] (6,) that move the image of a subject at a distance by about a pixel."""
+    return np.repeat([1.0, distance], 3) / camera.K[0, 0]
+
+
 def align_camera(
     render: Callable[[Camera], np.ndarray], camera: Camera, image: np.ndarray, mask: np.ndarray | None, distance: float
 ) -> Camera:
     """Return the camera whose render is nearest to a photograph by least squares, searched near the given pose.
-
-    A motion has six numbers [pixel]: a rotation about the camera's position and a translation, both in the axes of the world,
-    each in units that move the image of the subject by about a pixel. Derivatives are differences of renders. Source: Levenberg
-    1944, Marquardt 1963 (damped least squares).
 
     Args:
         render: view (H, W, 3) of a model from a camera.
@@ -248,25 +301,16 @@ def align_camera(
         mask: (H, W) bool, False for pixels that do not count; None: all pixels count.
         distance: of the subject from the camera [length].
     """
-    unit = np.repeat([1.0, distance], 3) / camera.K[0, 0]
+    unit = motion_unit(camera, distance)
     used = np.ones(image.shape[:2], bool) if mask is None else mask
 
-    def error(motion: np.ndarray) -> np.ndarray:
-        move = motion * unit
-        return (render(move_camera(camera, move[:3], move[3:])) - image)[used].ravel()
+    def moved(motion: np.ndarray) -> Camera:
+        return move_camera(camera, motion[:3] * unit[:3], motion[3:] * unit[3:])
 
-    motion, damping = np.zeros(6), DAMPING[0]
-    residual = error(motion)
+    def error(motions: np.ndarray) -> np.ndarray:
+        return (render(moved(motions[0])) - image)[used].reshape(1, -1)
+
+    found = Motions.none(1)
     for _ in range(ALIGNMENT_ITERATIONS):
-        slopes = np.stack([(error(motion + MOTION_STEP * axis) - residual) / MOTION_STEP for axis in np.eye(6)], axis=1)
-        normal, gradient = slopes.T @ slopes, slopes.T @ residual
-        if not np.trace(normal) > 0:  # the model shows nothing that a motion would change
-            break
-        diagonal = np.diag(np.maximum(np.diag(normal), 1e-6 * np.trace(normal)))
-        tried = motion - np.linalg.solve(normal + damping * diagonal, gradient)
-        moved = error(tried)
-        is_better = moved @ moved < residual @ residual
-        motion, residual = (tried, moved) if is_better else (motion, residual)
-        damping *= DAMPING[1] if is_better else DAMPING[2]
-    move = motion * unit
-    return move_camera(camera, move[:3], move[3:])
+        found = found.improve(error)
+    return moved(found.motion[0])

@@ -22,6 +22,7 @@ from mivol.optim.photographs.radiance_plan import RadianceStage, estimate_bytes
 from mivol.optim.photographs.radiance_problem import RadianceProblem, begin_radiance_fit, current_field
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.photos import Lens, Photo
+from mivol.photos.camera import motion_unit, move_camera
 from mivol.transport.line_integrals.radiance_field import find_occupied_cells, make_model, render_rays
 from mivol.transport.line_integrals.radiance_source import bake
 
@@ -60,7 +61,8 @@ def test_finer_stage_continues_the_last_stage(variant_rgb: str, photos: list[Pho
 def test_resumed_fit_equals_an_uninterrupted_fit(one_thread, photos: list[Photo], tmp_path: Path, steps: int) -> None:
     """With one thread every value and every mean square is equal to the last bit, and what is forgotten shows in it."""
     batches, path = RayBatches.from_photos(photos[:6], (1, 2)), tmp_path / "checkpoint.npz"
-    plan = replace(PLAN, stages=(RadianceStage(8, 10, 2, 3, 8), RadianceStage(16, 10, 1, 3, 8)), tv_density=0.1, first_degree=0)
+    stages = RadianceStage(8, 10, 2, 3, 8), RadianceStage(16, 10, 1, 3, 8)
+    plan = replace(PLAN, stages=stages, tv_density=0.1, first_degree=0, poses=True, align_every=4)
 
     def begin(store: CheckpointFile) -> Fit:
         return begin_fit(RadianceProblem(batches, BOX, plan), plan.optimizer, plan.course(), checkpoint=store)
@@ -74,8 +76,41 @@ def test_resumed_fit_equals_an_uninterrupted_fit(one_thread, photos: list[Photo]
     kept, found = whole.run.pack(), resumed.run.pack()
     assert kept.keys() == found.keys() == {"reals/density", "reals/harmonics", "roots/density", "roots/harmonics"}
     assert all(np.array_equal(kept[name], found[name]) for name in kept)
+    motions = whole.problem.poses.motions, resumed.problem.poses.motions
+    assert np.array_equal(motions[0].motion, motions[1].motion) and motions[0].motion.any()
     assert [row["loss"] for row in resumed.history] == [row["loss"] for row in whole.history]
     assert resumed.log == whole.log
+
+
+def test_cameras_move_to_where_the_field_agrees_with_the_photographs(variant_rgb: str, photos: list[Photo]) -> None:
+    """The true field and poses that are off by about a pixel: after four corrections a tenth of the error is left."""
+    rng, count = np.random.default_rng(5), 6
+    units = np.array([motion_unit(view.camera, 3.0) for view in photos[:count]])
+    off = rng.standard_normal((count, 6)) * units
+    given = [replace(v, camera=move_camera(v.camera, m[:3], m[3:])) for v, m in zip(photos, off, strict=False)]
+    plan = replace(PLAN, stages=(RadianceStage(24, 1, 1, 4),), poses=True)
+    problem = RadianceProblem(RayBatches.from_photos(given), BOX, plan)
+    problem.field = ball()
+    problem.update_occupancy()
+
+    def error() -> float:
+        pairs = zip(problem.posed.cameras, given, strict=True)
+        return np.sqrt(np.mean([(render_view(problem.field, c, WHITE).image - v.image) ** 2 for c, v in pairs]))
+
+    before = error()
+    for iteration in range(4):
+        said = problem.align_cameras(iteration)
+    assert error() < 0.1 * before
+    assert said.startswith("cameras moved by 2")
+
+
+def test_pixels_are_seen_from_moved_cameras(variant_rgb: str, photos: list[Photo]) -> None:
+    """The rays of moved cameras are those of photographs that were taken there."""
+    moved = [replace(v, camera=move_camera(v.camera, np.array([0.1, 0, 0.2]), np.array([0, 0.3, 0]))) for v in photos[:3]]
+    found = RayBatches.from_photos(photos[:3]).with_cameras([view.camera for view in moved])
+    wanted = RayBatches.from_photos(moved)
+    assert np.array_equal(found.lenses, wanted.lenses) and np.array_equal(found.origins, wanted.origins)
+    assert not np.array_equal(found.origins, RayBatches.from_photos(photos[:3]).origins)
 
 
 def give_back() -> None:

@@ -16,11 +16,11 @@ import mitsuba as mi
 
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.optim.photographs.photo_colours import Exposure, LinearScale, SrgbScale, compare_rays, mean_of
+from mivol.optim.photographs.photo_colours import Exposure, LinearScale, RayErrors, SrgbScale, compare_rays, mean_of
 from mivol.optim.photographs.ray_batches import DepthRays, PixelTable, RayBatch, depth_loss_gradient
 from mivol.optim.priors import Move, move_values
 from mivol.optim.problem import Reals
-from mivol.transport.line_integrals.radiance_field import Model, RayGradient, make_model, render_rays, vjp_rays
+from mivol.transport.line_integrals.radiance_field import Model, RayGradient, RenderedRays, make_model, render_rays, vjp_rays
 from mivol.transport.line_integrals.radiance_source import Baked, bake, vjp_bake
 from mivol.transport.traversal.occupied_cells import OccupiedCells
 
@@ -107,10 +107,7 @@ def differentiate_batch(
     source = bake(field, cells, batch.origins, batch.slot, slope=True)
     colours, count = make_model(field, settings.stop), dr.width(batch.slot)
     rendered = render_rays(cells, source, colours, batch.rays)
-    backdrop = batch.background if background is None else background
-    backdrop = backdrop if sky is None else sky.eval(batch.rays.d)
-    gain = exposure.gains(batch.view) if settings.has_gains else None
-    errors = compare_rays(batch, rendered.colour, rendered.T, backdrop, settings.scale, gain)
+    errors = _compare_batch(settings, model, batch, rendered, background)
     by_radiance, by_T, loss = errors.by_radiance * share, errors.by_T * share, errors.loss
     if settings.beta > 0:
         # Bounded: at 0 and 1 the prior is satisfied, and its derivative is infinite.
@@ -129,6 +126,30 @@ def differentiate_batch(
         by_log_gain = errors.by_colour * errors.colour * share if settings.has_gains else mi.Color3f(0)
         gradient["exposure"] = exposure.gradient(batch.view, by_log_gain)
     return loss, gradient
+
+
+def find_errors(settings: GradientSettings, model: FieldModel, pixels: PixelTable, offsets: mi.Float) -> mi.Color3f:
+    """Weighted differences of rays from their photographs, over the photographs' own backgrounds; arguments as
+    :func:`differentiate_tiles`.
+    """
+    batch = pixels.make_tiles(offsets)
+    source = bake(model.field, model.cells, batch.origins, batch.slot)
+    rendered = render_rays(model.cells, source, make_model(model.field, settings.stop), batch.rays)
+    return _compare_batch(settings, model, batch, rendered).error
+
+
+def _compare_batch(
+    settings: GradientSettings,
+    model: FieldModel,
+    batch: RayBatch,
+    rendered: RenderedRays,
+    background: mi.Color3f | None = None,
+) -> RayErrors:
+    """Compare rendered rays, over the sky or a background, with their photographs."""
+    backdrop = batch.background if background is None else background
+    backdrop = backdrop if model.sky is None else model.sky.eval(batch.rays.d)
+    gain = model.exposure.gains(batch.view) if settings.has_gains else None
+    return compare_rays(batch, rendered.colour, rendered.T, backdrop, settings.scale, gain)
 
 
 def _add_depth_gradient(

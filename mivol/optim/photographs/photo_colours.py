@@ -108,12 +108,14 @@ class RayErrors:
 
     Attributes:
         colour: rendered colour over the backdrop, with the gain.
+        error: weighted difference of this colour and the photograph's.
         loss: squared error of each ray, weighted, mean over rgb.
         by_colour, by_radiance, by_T: derivatives of the mean loss over rays by the colour with the gain, by the radiance
             without, and by the transmittance.
     """
 
     colour: mi.Color3f
+    error: mi.Color3f
     loss: mi.Float
     by_colour: mi.Color3f
     by_radiance: mi.Color3f
@@ -145,7 +147,7 @@ def compare_rays(
     error *= batch.counted * weight
     by_colour = error * weight * (2 / (3 * dr.width(batch.slot)))
     by_radiance = by_colour * gain
-    return RayErrors(colour, dr.squared_norm(error) * (1 / 3), by_colour, by_radiance, dr.dot(by_radiance, backdrop))
+    return RayErrors(colour, error, dr.squared_norm(error) * (1 / 3), by_colour, by_radiance, dr.dot(by_radiance, backdrop))
 
 
 def mean_of(values: mi.Float) -> mi.Float:

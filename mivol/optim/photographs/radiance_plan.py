@@ -16,7 +16,7 @@ import numpy as np
 
 from mivol import back_end
 from mivol.fields.harmonics import basis_size, row_width
-from mivol.optim.events import CoarseToFine, DropUnseen, Event, UpdateOccupancy
+from mivol.optim.events import AlignCameras, CoarseToFine, DropUnseen, Event, UpdateOccupancy
 from mivol.optim.first_order import RMSprop
 from mivol.optim.loop import Course
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
@@ -89,6 +89,8 @@ class RadiancePlan:
         sky_rate: initial learning rate of the sky [radiance]; a low rate would let the field fill the box with the background.
         sky_smooth: share by which a texel moves to its neighbours per step; no texel then stays at its start.
         exposure: whether photographs have a gain per channel (:mod:`mivol.optim.photographs.photo_colours`), if they disagree.
+        poses: whether the cameras of the photographs move with the fit.
+        align_every: steps between two corrections of the cameras, if they move.
         levels: number of nested boxes, each of twice the extent (:mod:`mivol.fields.spherical_grid`).
         fewer_levels: whether fewer levels suffice if they hold the points of a reconstruction and the cameras.
         near: distance in medians of the camera distances from the box's centre, below which derivatives fall with the square of
@@ -132,6 +134,8 @@ class RadiancePlan:
     sky_rate: float = 0.1
     sky_smooth: float = 0.0
     exposure: bool = False
+    poses: bool = False
+    align_every: int = 25
     levels: int = 1
     fewer_levels: bool = True
     near: float = 0.0
@@ -175,7 +179,8 @@ class RadiancePlan:
     def course(self, *more: Event) -> Course:
         """All steps, with the events of the plan and further events."""
         own = (CoarseToFine(at=self.stage_starts), DropUnseen(at=self.drop_steps), UpdateOccupancy(every=self.occupancy_every))
-        return Course(self.steps, events=(*own, *more))
+        align = (AlignCameras(every=self.align_every),) if self.poses else ()
+        return Course(self.steps, events=(*own, *align, *more))
 
     def with_longest(self, longest: int) -> RadiancePlan:
         """The plan with another number of nodes along the longest edge at its end; coarser stages stay.

@@ -38,15 +38,18 @@ from mivol.optim.photographs.batch_gradient import (
     GradientSettings,
     differentiate_batch,
     differentiate_tiles,
+    find_errors,
     keep_free,
     move_numbers,
     move_rows,
 )
+from mivol.optim.photographs.moving_cameras import MovingCameras
 from mivol.optim.photographs.photo_colours import AGREE, GAIN_RATE, SCALES, Exposure, pull_at
 from mivol.optim.photographs.radiance_plan import RadiancePlan
 from mivol.optim.photographs.ray_batches import POINTS_PER_VIEW, DepthRays, RayBatch, RayBatches, sample_depth_rays
 from mivol.optim.priors import Neighbours, Rows
 from mivol.optim.problem import Divide, DividedProblem, Reals, Refinement, SparseProblem, to_tensors
+from mivol.photos.camera import Motions
 from mivol.photos.region import is_free_space, median_distance
 from mivol.space import place_grid
 from mivol.transport.line_integrals.radiance_field import find_occupied_cells, make_model, raise_to_max_weights
@@ -84,6 +87,7 @@ class RadianceProblem(SparseProblem, DividedProblem):
         field: present field; a thin fog at first.
         sky: present background, if the plan has a sky.
         exposure: gains of the photographs, if the plan has gains.
+        poses: motions of the cameras, if the plan refines poses.
         has_gains: whether gains are fitted; False, with all gains 1, once the photographs turn out to agree.
         stage: number of the current stage.
 
@@ -102,6 +106,7 @@ class RadianceProblem(SparseProblem, DividedProblem):
     field: SphericalGrid = dataclasses.field(init=False)
     sky: Sky | None = dataclasses.field(init=False, default=None)
     exposure: Exposure | None = dataclasses.field(init=False, default=None)
+    poses: MovingCameras | None = dataclasses.field(init=False, default=None)
     has_gains: bool = dataclasses.field(init=False)
     stage: int = dataclasses.field(init=False, default=0)
 
@@ -121,6 +126,8 @@ class RadianceProblem(SparseProblem, DividedProblem):
                 raise MivolError("found gains and photographs with alpha, which have equal exposures: set exposure = false.")
             self.exposure = Exposure.neutral(len(self.batches.origins))
         self.has_gains = self.plan.exposure
+        if self.plan.poses:
+            self.poses = MovingCameras(self.batches, median_distance(self.batches.cameras, self.box.mean(axis=0)))
         self.scale = SCALES[self.batches.space]
         self.unit = float((self.box[1] - self.box[0]).max()) / 2
         self.near = self.plan.near_distance(self.batches.origins, self.box)
@@ -188,7 +195,7 @@ class RadianceProblem(SparseProblem, DividedProblem):
         step = self._draw_step(iteration, views)
         numbers = list(range(len(step.views)) if only is None else only)
         chosen = step.views[numbers]
-        pixels = self.batches.tabulate(self.plan.stages[self.stage].shrink, chosen, step.corner[numbers])
+        pixels = self.posed.tabulate(self.plan.stages[self.stage].shrink, chosen, step.corner[numbers])
         depth_rays = self._draw_depth_rays(step.views, iteration) if 0 in numbers else None
         if depth_rays is not None:
             depth_rays = dataclasses.replace(depth_rays, count=dr.opaque(mi.UInt32, depth_rays.count))
@@ -198,7 +205,7 @@ class RadianceProblem(SparseProblem, DividedProblem):
             self._field_model(),
             reals,
             pixels,
-            self.field.offsets_from(self.batches.origins[chosen]),
+            self.field.offsets_from(self.posed.origins[chosen]),
             _opaque_colour(step.background),
             depth_rays,
         )
@@ -223,13 +230,15 @@ class RadianceProblem(SparseProblem, DividedProblem):
         return self._drawn[1]
 
     def step_state(self) -> dict[str, Any]:
-        """The nodes and the listed cells."""
-        nodes = self.field.nodes
-        return {"stage": self.stage, "has_gains": self.has_gains, "nodes": nodes, "cells": self._cells}
+        """The nodes, the listed cells and the motions of the cameras."""
+        state = {"stage": self.stage, "has_gains": self.has_gains, "nodes": self.field.nodes, "cells": self._cells}
+        return state | {"motions": None if self.poses is None else self.poses.motions}
 
     def take_step_state(self, state: dict[str, Any]) -> None:
         """Nodes and cells of the same problem in another process; the next reals have a value for each node."""
         self.stage, self.has_gains, self._cells = state["stage"], state["has_gains"], state["cells"]
+        if self.plan.poses:
+            self.poses.set_motions(state["motions"])
         grid, degree = place_grid(self.box, self.plan.stages[self.stage].longest), self.plan.degree_at(self.stage)
         rows = math.prod(grid[0]) if state["nodes"] is None else dr.width(state["nodes"]) + 1
         values = dr.zeros(mi.Float, rows), dr.zeros(mi.Float, rows * row_width(basis_size(degree)))
@@ -246,7 +255,7 @@ class RadianceProblem(SparseProblem, DividedProblem):
         voxel, rng = 2 * self.unit / self.plan.stages[self.stage].longest, np.random.default_rng((self.seed, iteration, 1))
         points = [self.batches.points[view] for view in chosen]
         least = len(points) * POINTS_PER_VIEW
-        return sample_depth_rays(points, self.batches.origins[chosen], self.box, self.plan.levels, voxel, rng, least)
+        return sample_depth_rays(points, self.posed.origins[chosen], self.box, self.plan.levels, voxel, rng, least)
 
     def batch_loss_and_gradient(
         self,
@@ -304,6 +313,27 @@ class RadianceProblem(SparseProblem, DividedProblem):
             "density": Rows(1, self._neighbours, density, self.unit, self._first_row, iteration),
             "harmonics": Rows(self.field.width, self._neighbours, self.scale.rate * sh, 1.0, self._first_row, iteration),
         }
+
+    # -- Poses --------------------------------------------------------------------------------------------------------
+
+    @property
+    def posed(self) -> RayBatches:
+        """The photographs from where the fit has moved their cameras."""
+        return self.batches if self.poses is None else self.poses.posed
+
+    def align_cameras(self, iteration: int) -> str:
+        """Correct the poses of the photographs; returns a sentence for the log."""
+        stage, rng = self.plan.stages[self.stage], np.random.default_rng((self.seed, iteration, 2))
+        settings, model = self._gradient_settings(1.0), self._field_model()
+
+        def find(posed: RayBatches, views: np.ndarray, corner: np.ndarray) -> np.ndarray:
+            pixels, offsets = posed.tabulate(stage.shrink, views, corner), self.field.offsets_from(posed.origins[views])
+            error = np.array(self._recorded.call(find_errors, settings, model, pixels, offsets), np.float64)
+            self.safe_point()
+            return error.reshape(3, len(views), -1).transpose(1, 0, 2).reshape(len(views), -1)
+
+        moved = self.poses.correct(find, stage.shrink, stage.views, rng)
+        return f"cameras moved by {moved:.2g} pixels so far (root mean square)"
 
     # -- Stages -------------------------------------------------------------------------------------------------------
 
@@ -375,9 +405,9 @@ class RadianceProblem(SparseProblem, DividedProblem):
         cells, model = find_occupied_cells(self.field), make_model(self.field, self.plan.stop)
         weight = dr.zeros(mi.Float, max(cells.count, 1))
         shrink = max(self.batches.levels)
-        for view, origin in enumerate(self.batches.origins):
+        for view, origin in enumerate(self.posed.origins):
             source = bake(self.field, cells, origin[None], mi.UInt32(0))
-            raise_to_max_weights(cells, source, model, self.batches.all_pixels(shrink, view).rays, weight)
+            raise_to_max_weights(cells, source, model, self.posed.all_pixels(shrink, view).rays, weight)
             dr.eval(weight)
             self.safe_point()
         return _nodes_of(self.field, cells, weight >= self.plan.keep_weight)
@@ -389,11 +419,14 @@ class RadianceProblem(SparseProblem, DividedProblem):
         self.set_reals(reals)
         self.update_occupancy()
         nodes = {} if self.field.nodes is None else {"nodes": np.array(self.field.nodes)}
-        return {"stage": np.array(self.stage), "has_gains": np.array(self.has_gains), **nodes}
+        poses = {} if self.poses is None else dataclasses.asdict(self.poses.motions)
+        return {"stage": np.array(self.stage), "has_gains": np.array(self.has_gains), **nodes, **poses}
 
     def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
         """Continue from the arrays of :meth:`pack`, with the same plan, photographs and box."""
         self.stage, self.has_gains = int(arrays["stage"]), bool(arrays["has_gains"])
+        if self.plan.poses:
+            self.poses.set_motions(Motions(arrays["motion"], arrays["damping"]))
         grid, degree = place_grid(self.box, self.plan.stages[self.stage].longest), self.plan.degree_at(self.stage)
         nodes = mi.UInt32(arrays["nodes"]) if "nodes" in arrays else None
         values = reals["density"].array, reals["harmonics"].array

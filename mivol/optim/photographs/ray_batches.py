@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import drjit as dr
@@ -232,6 +232,14 @@ class RayBatches:
         known = points if any(map(len, points)) else ()
         cameras = tuple(photo.camera for photo in photos)
         return cls(origins, mi.Float(lenses.reshape(-1)), levels, 4 if with_alpha else 3, space, known, cameras)
+
+    def with_cameras(self, cameras: Sequence[Camera]) -> RayBatches:
+        """The same pixels from other poses: ``cameras`` with the lenses and sizes of the photographs'."""
+        lenses = np.array(self.lenses).reshape(-1, LENS)
+        lenses[:, 4:13] = [camera.to_world[:3, :3].ravel() for camera in cameras]
+        origins = np.array([camera.origin for camera in cameras])
+        lenses[:, 13:16] = origins
+        return replace(self, origins=origins, lenses=mi.Float(copy_aligned(lenses.ravel())), cameras=tuple(cameras))
 
     @property
     def bytes(self) -> int:
