@@ -18,7 +18,7 @@ def convert(arguments: argparse.Namespace) -> None:
 
     A field (.npz) is the mivol_sh of a scene, an octree, a hash grid or a NeRF. --to grid, octree, hash or nerf makes one of
     another field or of Gaussians (.ply); hash and nerf fit a network to views of the source. Fields become Gaussians as well.
-    These conversions print their error in dB, from views of both. A mesh (.obj, or .ply
+    These conversions print their error in dB, from views of both. A mesh (.obj, or .glb with a texture, or .ply
     with --to mesh) is fused from depths of splatted views; convert prints the distance between mesh and splats.
     A scene of pbrt-v4 (.pbrt) becomes Mitsuba XML (.xml) with media of mivol.
     """

@@ -195,6 +195,9 @@ class FitKind(ABC):
     def digests(self) -> dict[str, str]:
         """Return hashes of the data. A resumed run must have the same hashes."""
 
+    def begin(self, run: RunFolder) -> None:  # noqa: B027
+        """Write what a viewer shows before the first model, once the folder belongs to the run."""
+
     def evaluate(self, fit: Fit) -> Evaluation | None:
         """Evaluate the newest iterate; None if no evaluation is due."""
         return None

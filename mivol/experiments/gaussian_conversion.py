@@ -15,16 +15,17 @@ from mivol.fields.field_files import LONGEST_EDGE, read_grid, write_emission_sce
 from mivol.fields.gaussian_field import MAX_OPACITY
 from mivol.fields.gaussian_grid import gaussian_box, gaussian_masses, gaussians_to_grid
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.fields.surfaces import DepthView, fuse_depths
-from mivol.files.mesh import MESH_WRITERS, Mesh, write_mesh
+from mivol.fields.surfaces import DepthView, fuse_depths, interpolate_corners
+from mivol.files.mesh import MESH_WRITERS, Atlas, Mesh, write_mesh
 from mivol.files.source import check_file, refusal, select_by_suffix
 from mivol.optim.photographs.field_view import render_view
-from mivol.photos import Camera, aim_camera, intrinsics, pixel_centres, rays
+from mivol.photos import Camera, aim_camera, intrinsics, pixel_centres, project, rays
 from mivol.photos.camera_path import HomeView
 from mivol.points.cloud import read_points
 from mivol.points.conversions import points_to_gaussians
 from mivol.points.gaussian_files import is_gaussian_file, read_gaussian_view, read_gaussians, write_gaussians
 from mivol.points.gaussians import Gaussians
+from mivol.points.summary import crop_cloud
 from mivol.scene_graph import traverse
 from mivol.splatting.splatter import Splatter, to_tensors
 from mivol.validate.metrics import psnr
@@ -178,9 +179,10 @@ def convert_to_mesh(source: Path, target: Path, resolution: int, box: Sequence[f
 
     Args:
         source: file of Gaussians or points in a known format.
-        target: file ending in .ply or .obj.
+        target: file ending in .ply or .obj, or in .glb, which has a texture.
         resolution: voxels of the fused distances along the longest edge of the box.
-        box: two corners, six numbers [length]; None means three standard deviations around the Gaussians.
+        box: two corners, six numbers [length], of the Gaussians that become the mesh; None means three standard deviations
+            around all of them.
         variant: Mitsuba variant.
 
     Returns:
@@ -193,7 +195,12 @@ def convert_to_mesh(source: Path, target: Path, resolution: int, box: Sequence[f
     set_variant(variant)
     cloud = read_as_gaussians(source)
     low, high = corners_of_box(cloud, box)
+    if box is not None:
+        # What stands around the box would hide it from the views.
+        cloud = crop_cloud(cloud, box, source)
     mesh, view = mesh_of_gaussians(cloud, low, high, resolution), read_gaussian_view(source)
+    if target.suffix.lower() == ".glb":
+        mesh = replace(mesh, texture=paint_mesh(cloud, mesh, low, high, resolution))
     write_mesh(target, mesh if view is None else replace(mesh, up=view.up))
     loss, voxel = measure_mesh_error(cloud, mesh, low, high), float((high - low).max()) / resolution
     nine_tenths = f"{loss.most:.3g} for nine tenths of the pixels ({loss.most / voxel:.2g} voxels)"
@@ -219,6 +226,79 @@ def mesh_of_gaussians(cloud: Gaussians, low: np.ndarray, high: np.ndarray, resol
     """
     cameras = cameras_around(box_to_world(low, high), FINENESS * resolution, FUSED)
     return fuse_depths(_splat_depths(cloud, cameras), low, high, resolution)
+
+
+PAINTED = 4
+"""Views that paint a triangle: those that see its middle most squarely."""
+
+SLANT = 0.1
+"""Least cosine between the normal of a triangle and the direction to a view that paints it."""
+
+DEEP = 2.0
+"""Largest distance between a texel and the depth of a view that paints it [voxel]."""
+
+
+def paint_mesh(cloud: Gaussians, mesh: Mesh, low: np.ndarray, high: np.ndarray, resolution: int) -> np.ndarray:
+    """The texture of a mesh from splatted views: means of the views that see a texel, weighted by squared cosines.
+
+    Views have twice the pixels of those that made the mesh. Texels that no view sees have the colours of the points.
+
+    Args:
+        cloud: Gaussians.
+        mesh: mesh of the Gaussians, with colours.
+        low, high: corners (3,) of the box [length].
+        resolution: voxels along the longest edge of the box.
+
+    Returns:
+        Image of the atlas, uint8 (H, W, 3).
+
+    Raises:
+        MivolError: more triangles than a texture holds.
+    """
+    atlas, deep = Atlas.of(len(mesh.faces)), DEEP * float((high - low).max()) / resolution
+    corners = mesh.points[mesh.faces]
+    middles, across = corners.mean(axis=1), np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
+    views, best, cosines = [], np.zeros((len(corners), PAINTED), int), np.zeros((len(corners), PAINTED))
+    cameras = cameras_around(box_to_world(low, high), 2 * FINENESS * resolution, FUSED)
+    for number, view in enumerate(_splat_depths(cloud, cameras)):
+        views.append(replace(view, depth=view.depth.astype(np.float32), colour=np.rint(255 * view.colour).astype(np.uint8)))
+        towards = view.camera.origin - middles
+        cosine = (across * towards).sum(axis=1) / np.maximum(np.linalg.norm(towards, axis=1), 1e-30)
+        cosine = np.where((cosine > SLANT) & _look_up(view, middles, deep)[1], cosine, 0)
+        worst = cosines.argmin(axis=1)
+        better = np.flatnonzero(cosine > cosines[np.arange(len(worst)), worst])
+        best[better, worst[better]], cosines[better, worst[better]] = number, cosine[better]
+
+    def colour(numbers: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Colours of texels."""
+        total = 1e-6 * interpolate_corners(mesh.colours, mesh.faces[numbers], weights)
+        sums = np.full((*total.shape[:2], 1), 1e-6)
+        places = interpolate_corners(mesh.points, mesh.faces[numbers], weights)
+        for number, view in enumerate(views):
+            for rank in range(PAINTED):
+                at = np.flatnonzero((best[numbers, rank] == number) & (cosines[numbers, rank] > 0))
+                seen, is_seen = _look_up(view, places[at].reshape(-1, 3), deep)
+                share = (cosines[numbers[at], rank] ** 2)[:, None, None] * is_seen.reshape(len(at), len(weights), 1)
+                total[at] += share * seen.reshape(len(at), len(weights), 3)
+                sums[at] += share
+        return total / sums
+
+    return atlas.paint(colour)
+
+
+def _look_up(view: DepthView, points: np.ndarray, deep: float) -> tuple[np.ndarray, np.ndarray]:
+    """Colours (N, 3) of a view at points, linear between pixels, and whether the view sees each of them."""
+    pixel, depth = project(view.camera, points)
+    inside = (depth > 0) & ((pixel >= 0) & (pixel < view.camera.size)).all(axis=1)
+    pixel = np.where(inside[:, None], pixel, 0.5)
+    column, row = pixel.astype(int).T
+    inside &= np.abs(view.depth[row, column] - depth) < deep
+    low = np.clip(np.floor(pixel - 0.5).astype(int), 0, np.array(view.camera.size) - 2)
+    x, y = np.clip(pixel - 0.5 - low, 0, 1).T[..., None]
+    (i, j), codes = low.T[::-1], view.colour
+    top, bottom = ((1 - x) * codes[i + k, j] + x * codes[i + k, j + 1] for k in (0, 1))
+    return ((1 - y) * top + y * bottom) / 255, inside
 
 
 @dataclass(frozen=True)

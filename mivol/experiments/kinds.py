@@ -161,6 +161,7 @@ def complete_fit(
     fit = begin_fit(kind.problem, kind.optimizer(), course, measure=measure if is_measured else None, checkpoint=store)
     best.restore()
     run.begin(fit.next_iteration + kind.first_row - 1)
+    kind.begin(run)
     with context.progress.watch(course.iterations) as show:
         fit.complete(observe)
     best.settle()

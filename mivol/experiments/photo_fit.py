@@ -262,6 +262,10 @@ class PhotoFit(FitKind):
     def digests(self) -> dict[str, str]:
         return {"photos": self.problem.batches.digest()}
 
+    def begin(self, run: RunFolder) -> None:
+        photos = self.settings.photos
+        run.write_photographs(self.context.base / photos.path, photos.held_out, photos.fold)
+
     def evaluate(self, fit: Fit) -> Evaluation | None:
         if fit.next_iteration % self.settings.show.every and fit.next_iteration != self.plan.steps:
             return None

@@ -7,6 +7,7 @@ file is written atomically. The files of an earlier run move to ``earlier/`` whe
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import time
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.files import write_volume
+from mivol.files import write_volume, write_whole_text
 from mivol.files.atomic import disk_faults, lock_folder, remove_temporaries
 from mivol.optim import checkpoint
 from mivol.report import figures
@@ -199,6 +200,15 @@ class RunFolder:
         step = -(-max(values.shape[:3]) // NEWEST_EDGE)
         write_volume(self.path / NEWEST, np.ascontiguousarray(values[::step, ::step, ::step]), to_world)
 
+    def write_photographs(self, path: Path, held_out: int, fold: int) -> None:
+        """Write where the photographs of a fit are, from the run folder on, for a viewer."""
+        try:
+            named = os.path.relpath(path, self.path)
+        except ValueError:  # another drive
+            named = path.resolve()
+        text = json.dumps({"path": Path(named).as_posix(), "held_out": held_out, "fold": fold})
+        write_whole_text(self.path / PHOTOGRAPHS, text)
+
     def remove_newest(self) -> None:
         """Remove the volume for viewers, once the outputs of the run are written."""
         (self.path / NEWEST).unlink(missing_ok=True)
@@ -214,6 +224,9 @@ class RunFolder:
 
 NEWEST = "newest.npz"
 """The volume for viewers; it goes when a run begins anew or ends."""
+
+PHOTOGRAPHS = "photographs.json"
+"""Where the photographs of a fit are: ``path`` from the run folder on, and which of them judge the fit."""
 
 NEWEST_EDGE = 128
 """Longest edge of the volume for viewers [voxel]: of larger ones every second, third, ... voxel is written."""

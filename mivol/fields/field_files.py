@@ -220,7 +220,7 @@ def _write_volume_pair(path: Path, field: SphericalGrid) -> list[Path]:
 
 
 def _write_mesh(path: Path, field: SphericalGrid, options: WriteOptions) -> list[Path]:
-    mesh = extract_surface(field, options.level)
+    mesh = extract_surface(field, options.level, textured=path.suffix.lower() == ".glb")
     write_mesh(path, mesh if options.view is None else replace(mesh, up=options.view.up))
     return [path]
 
@@ -237,7 +237,7 @@ FIELD_FORMATS: dict[str, FieldFormat] = {
     ".nrrd": FieldFormat("pair of NRRD volumes", _write_volumes),
     ".ply": FieldFormat("mesh with colours", _write_mesh),
     ".obj": FieldFormat("mesh with colours", _write_mesh),
-    ".glb": FieldFormat("mesh with colours", _write_mesh),
+    ".glb": FieldFormat("mesh with a texture", _write_mesh),
     ".xml": FieldFormat("scene of Mitsuba", _write_scene),
 }
 """Suffix -> format. The longest suffix that fits a name counts."""

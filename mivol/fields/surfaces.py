@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 import numpy as np
@@ -36,7 +36,7 @@ from scipy.ndimage import map_coordinates
 from mivol.errors import MivolError
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import encode_srgb
-from mivol.files.mesh import Mesh
+from mivol.files.mesh import Atlas, Mesh
 from mivol.machine import check_memory
 from mivol.photos import Camera, project
 
@@ -54,12 +54,13 @@ def default_level(field: SphericalGrid) -> float:
     return min(math.log(2) / float(edges.max()), mean / 2)
 
 
-def extract_surface(field: SphericalGrid, level: float | None = None) -> Mesh:
+def extract_surface(field: SphericalGrid, level: float | None = None, textured: bool = False) -> Mesh:
     """The surface of one extinction, with colours as seen from outside along the normal.
 
     Args:
         field: any field; a sparse field is laid out densely.
         level: extinction [1/length]; None: :func:`default_level`, for each level of a nested field.
+        textured: whether the mesh has a texture too.
 
     Returns:
         A mesh in world coordinates, counterclockwise from outside. Normals are means of the triangles around a point.
@@ -68,25 +69,47 @@ def extract_surface(field: SphericalGrid, level: float | None = None) -> Mesh:
         triangles differ from the trilinear field by O(voxel^2).
 
     Raises:
-        MivolError: a level that is not above 0 or that the field does not reach.
+        MivolError: a level that is not above 0 or that the field does not reach, or a texture of too many triangles.
     """
     if level is not None and not 0 < level < math.inf:
         raise MivolError(f"the level {level:g} was given for a surface; an extinction above 0 is expected.")
     grids = [field.extract_level(number) for number in range(field.levels)] if field.levels > 1 else [field]
-    meshes, largest, last = [], 0.0, len(grids) - 1
+    meshes, sources, largest, last = [], [], 0.0, len(grids) - 1
     for number, grid in enumerate(grids):
         density = grid.to_dense()[0].transpose(2, 1, 0)
         sigma = default_level(grid) if level is None else float(level)
         raw = grid.activation_function.inverse(sigma)
         largest = max(largest, float(np.array(grid.activation_function.value_and_slope(mi.Float(float(density.max())))[0])[0]))
         inner = None if number == 0 else grids[number - 1].to_world
-        meshes += _extract_grid_surface(grid, density, raw, inner, number == last)
+        found = _extract_grid_surface(grid, density, raw, inner, number == last)
+        meshes += found
+        sources += [grid] * len(found)
     if not meshes:
         raise MivolError(f"no node of the field reaches the extinction {sigma:g}, only {largest:g}; give a lower level.")
     firsts = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])
     faces = np.concatenate([mesh.faces + first for mesh, first in zip(meshes, firsts, strict=False)])
     points, normals, colours = (np.concatenate([getattr(m, k) for m in meshes]) for k in ("points", "normals", "colours"))
-    return Mesh(points, faces, normals, colours)
+    mesh = Mesh(points, faces, normals, colours)
+    if not textured:
+        return mesh
+    ends = np.cumsum([len(one.faces) for one in meshes])
+
+    def colour(numbers: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Colours of texels, each in the grid of its triangle."""
+        places, across = (interpolate_corners(values, faces[numbers], weights) for values in (points, normals))
+        across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
+        owner, image = np.searchsorted(ends, numbers, side="right"), np.zeros(places.shape)
+        for number, grid in enumerate(sources):
+            at = owner == number
+            image[at] = _eval_colours(grid, places[at].reshape(-1, 3), across[at].reshape(-1, 3)).reshape(image[at].shape)
+        return image
+
+    return replace(mesh, texture=Atlas.of(len(faces)).paint(colour))
+
+
+def interpolate_corners(values: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Values (N, T, 3) at the weights (T, 3) of the corners of faces (N, 3), of values (V, 3) at the points."""
+    return np.einsum("tc,nck->ntk", weights, values[faces])
 
 
 def _extract_grid_surface(

@@ -12,6 +12,7 @@ Source: Khronos Group, glTF 2.0 specification, 2021.
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 from collections.abc import Sequence
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+import PIL.Image
 
 from mivol.files.image_files import decode_srgb
 from mivol.files.source import read_bytes, refusal
@@ -35,6 +37,9 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 VERTICES, INDICES = 34962, 34963
 """Targets of buffer views."""
+
+LINEAR, CLAMP = 9729, 33071
+"""Filter of a texture, and what it shows beyond its edges: the edge."""
 
 
 class GlbWriter:
@@ -76,6 +81,21 @@ class GlbWriter:
         self._parts.append(data + bytes(-len(data) % 4))
         self._size += len(self._parts[-1])
         return len(self.document["accessors"]) - 1
+
+    def add_texture(self, image: np.ndarray) -> None:
+        """Add an image, uint8 (H, W, 3), as PNG, and show it on the first material."""
+        packed = io.BytesIO()
+        PIL.Image.fromarray(image).save(packed, "PNG")
+        data = packed.getvalue()
+        self.document["bufferViews"].append({"buffer": 0, "byteOffset": self._size, "byteLength": len(data)})
+        self.document |= {
+            "images": [{"bufferView": len(self.document["bufferViews"]) - 1, "mimeType": "image/png"}],
+            "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP, "wrapT": CLAMP}],
+            "textures": [{"source": 0, "sampler": 0}],
+        }
+        self.document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+        self._parts.append(data + bytes(-len(data) % 4))
+        self._size += len(self._parts[-1])
 
     def write(self, file: BinaryIO) -> None:
         """Write header, document and buffer."""
@@ -159,6 +179,7 @@ def write_glb_mesh(
     normals: np.ndarray | None = None,
     colours: np.ndarray | None = None,
     up: Sequence[float] = (0.0, 0.0, 1.0),
+    texture: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> None:
     """Write a triangle mesh.
 
@@ -169,6 +190,8 @@ def write_glb_mesh(
         normals: unit normals (V, 3), optional.
         colours: code values (V, 3) in 0..1, optional.
         up: upward direction, which the node turns to y.
+        texture: image, uint8 (H, W, 3) code values, and the place (V, 2) of each point in it, 0..1 from the upper left corner.
+            It is read without smaller copies, which would mix neighbours in an atlas. glTF multiplies it with colours.
     """
     writer = GlbWriter(
         scene=0,
@@ -191,6 +214,9 @@ def write_glb_mesh(
         linear = np.round(decode_srgb(colours) * 65535).astype(np.uint16)
         opaque = np.concatenate([linear, np.full((len(linear), 1), 65535, np.uint16)], axis=1)
         attributes["COLOR_0"] = writer.add(opaque, normalized=True)
+    if texture is not None:
+        attributes["TEXCOORD_0"] = writer.add(np.asarray(texture[1], np.float32))
+        writer.add_texture(texture[0])
     indices = writer.add(np.asarray(faces).astype(np.uint32).reshape(-1), INDICES)
     writer.document["meshes"] = [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}]
     writer.write(file)

@@ -5,11 +5,18 @@ Own reader and writers: plyfile is under the GPL.
 Conventions. Faces list their corners counterclockwise as seen from outside, from 0; an ``.obj`` counts from 1. Colours are
 code values 0..1. A ``.ply`` stores them twice: ``red green blue`` are code values of 8 bits, as most programs expect; ``r g b``
 are linear reflectances in float32, which Mitsuba's ``ply`` reads as ``vertex_color`` (it says that it ignores the others). An
-``.obj`` has colours after the coordinates, a common extension of the format.
+``.obj`` has colours after the coordinates, a common extension of the format. A ``.glb`` has a texture instead of colours, if
+the mesh has one: glTF multiplies the two.
+
+Atlas. The image of a texture has square cells of n x n texels, two triangles each. The legs of the first triangle join the
+centres of the texels (0, 0), (m, 0) and (0, m), m = n - 3. Linear interpolation inside it takes texels whose row and column add
+up to at most m + 1; the second triangle is the first one turned by half a turn, and takes those from n on. So no texel serves
+two triangles, and a cell needs no margin.
 """
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,6 +36,78 @@ PLY_HEAD = "ply\nformat binary_little_endian 1.0\n"
 FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 
 
+CELLS = (8, 6, 4)
+"""Texels along the edge of a cell, for two triangles; the first that fits in ``LARGEST`` is taken."""
+
+LARGEST = 4096
+"""Longest edge of a texture [texel], which every browser shows."""
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """The places of triangles in the image of a texture.
+
+    Attributes:
+        count: number of triangles.
+        cell: texels along the edge of a cell.
+        columns: cells along an edge of the image.
+
+    Source: the layout is derived above.
+    """
+
+    count: int
+    cell: int
+    columns: int
+
+    @classmethod
+    def of(cls, count: int) -> Atlas:
+        """The atlas of so many triangles.
+
+        Raises:
+            MivolError: more triangles than the largest image holds.
+        """
+        columns = max(1, math.isqrt(-(-count // 2) - 1) + 1)
+        cell = next((n for n in CELLS if n * columns <= LARGEST), None)
+        if cell is None:
+            most = 2 * (LARGEST // CELLS[-1]) ** 2
+            way_out = "choose a lower --resolution, or a mesh in .ply"
+            raise refusal("a texture", f"{count} triangles", f"at most {most}", way_out)
+        return cls(count, cell, columns)
+
+    def corners(self) -> np.ndarray:
+        """Coordinates (F, 3, 2) of the corners of each triangle in the image, 0..1, from the upper left corner."""
+        legs = np.array([[0, 0], [self.cell - 3, 0], [0, self.cell - 3]]) + 0.5
+        number = np.arange(self.count)
+        place = np.stack([number // 2 % self.columns, number // 2 // self.columns], axis=1)[:, None] * self.cell
+        return (place + np.where((number % 2 == 1)[:, None, None], self.cell - legs, legs)) / (self.cell * self.columns)
+
+    def texels(self) -> tuple[np.ndarray, np.ndarray]:
+        """Weights (2, n * n, 3) of the corners at the texels of a cell, and which of them serve its triangles, bool (2, n * n).
+
+        Texels beside the longest edge lie one texel outside, where the weight of the first corner is negative.
+        """
+        column, row = np.meshgrid(np.arange(self.cell), np.arange(self.cell))
+        places = np.stack([column.ravel(), row.ravel()], axis=1)
+        places = np.stack([places, self.cell - 1 - places])
+        share = places / (self.cell - 3)
+        weights = np.concatenate([1 - share.sum(axis=-1, keepdims=True), share], axis=-1)
+        return weights, places.sum(axis=-1) <= self.cell - 2
+
+    def paint(self, colour: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
+        """The image, uint8 (H, W, 3), of colours.
+
+        Args:
+            colour: from numbers of triangles (N,) and weights of their corners (T, 3) to code values (N, T, 3) in 0..1.
+        """
+        weights, serves = self.texels()
+        cells = np.zeros((self.columns**2, self.cell**2, 3), np.uint8)
+        for half in range(2):
+            chosen = colour(np.arange(half, self.count, 2), weights[half][serves[half]])
+            cells[: len(chosen), serves[half]] = np.rint(np.clip(chosen, 0, 1) * 255)
+        grid = cells.reshape(self.columns, self.columns, self.cell, self.cell, 3).swapaxes(1, 2)
+        return np.ascontiguousarray(grid.reshape(self.columns * self.cell, self.columns * self.cell, 3))
+
+
 @dataclass(frozen=True)
 class Mesh:
     """A triangle mesh.
@@ -39,6 +118,7 @@ class Mesh:
         normals: unit normals (V, 3) pointing outwards, optional.
         colours: code values (V, 3) in 0..1, optional.
         up: upward direction, which a ``.glb`` turns to its y; other formats leave it out.
+        texture: image of an :class:`Atlas` of the faces, uint8 (H, W, 3) code values, optional; only a ``.glb`` has it.
 
     Raises:
         MivolError: inconsistent shapes, or an index without a point.
@@ -49,6 +129,7 @@ class Mesh:
     normals: np.ndarray | None = None
     colours: np.ndarray | None = None
     up: tuple[float, ...] = (0.0, 0.0, 1.0)
+    texture: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         per_point = [a for a in (self.points, self.normals, self.colours) if a is not None]
@@ -128,7 +209,13 @@ def _write_obj(file: BinaryIO, mesh: Mesh) -> None:
 
 
 def _write_glb(file: BinaryIO, mesh: Mesh) -> None:
-    write_glb_mesh(file, mesh.points, mesh.faces, mesh.normals, mesh.colours, mesh.up)
+    if mesh.texture is None:
+        write_glb_mesh(file, mesh.points, mesh.faces, mesh.normals, mesh.colours, mesh.up)
+        return
+    # Each triangle has corners of its own, with places in the image.
+    apart, faces = mesh.faces.ravel(), np.arange(mesh.faces.size).reshape(-1, 3)
+    normals, places = None if mesh.normals is None else mesh.normals[apart], Atlas.of(len(faces)).corners().reshape(-1, 2)
+    write_glb_mesh(file, mesh.points[apart], faces, normals, None, mesh.up, (mesh.texture, places))
 
 
 #: suffix -> writer of a mesh to a binary file.

@@ -92,7 +92,7 @@ def convert_file(source: Path, target: Path, kind: str | None = None, box: Seque
     kind = kind or ("gaussians" if has_gaussians and target.suffix.lower() in GAUSSIAN_WRITERS else "points")
     contents = read_gaussians(source) if has_gaussians else read_points(source)
     if box is not None:
-        contents = _crop(contents, box, source)
+        contents = crop_cloud(contents, box, source)
     if kind == "gaussians":
         gaussians = points_to_gaussians(contents) if isinstance(contents, PointCloud) else contents
         write_gaussians(target, gaussians, read_gaussian_view(source))
@@ -102,7 +102,7 @@ def convert_file(source: Path, target: Path, kind: str | None = None, box: Seque
     return f"{target}: {cloud.count} points"
 
 
-def _crop(contents: Gaussians | PointCloud, box: Sequence[float], source: Path) -> Gaussians | PointCloud:
+def crop_cloud(contents: Gaussians | PointCloud, box: Sequence[float], source: Path) -> Gaussians | PointCloud:
     """The Gaussians or points inside a box.
 
     Raises:

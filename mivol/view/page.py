@@ -203,7 +203,7 @@ class Page:
     def _build(self) -> None:
         gui = self.server.gui
         gui.configure_theme(dark_mode=True, control_layout="collapsible", show_logo=False, show_share_button=False)
-        self._title = gui.add_markdown(f"**{self.subject.name}**")
+        self._title = gui.add_markdown(f"**{self.subject.title}**")
         self._exposure = gui.add_slider("exposure", -5.0, 5.0, 0.1, 0.0, hint="each unit doubles the light")
         self._on_look(self._exposure)
         if self.subject.has_values:
@@ -376,7 +376,7 @@ class Page:
     def refresh(self) -> None:
         """Show what has changed on disk."""
         if self.subject.refresh():
-            self._title.content = f"**{self.subject.name}**"
+            self._title.content = f"**{self.subject.title}**"
             self.painter.change()
 
     def stop(self) -> None:

@@ -6,6 +6,7 @@ newest one. A viewer of an unfinished run takes the lowest priority of the opera
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -13,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mivol.experiments.run_folder import CHECKPOINT, NEWEST
+from mivol.errors import MivolError
+from mivol.experiments.run_folder import NEWEST, PHOTOGRAPHS
 from mivol.files.formats import is_volume
 from mivol.files.source import refusal
-from mivol.optim import checkpoint
 from mivol.photos import Camera, PhotoSurvey, find_format
 from mivol.points.summary import is_points_file
 from mivol.report.record import RECORD, read_record
@@ -97,7 +98,7 @@ def _open(path: Path, dataset: str | None, defines: Mapping[str, str] | None, sa
 
 
 def wait_for_run(folder: Path, say: Callable[[str], None]) -> Subject:
-    """The model of a run; waits for the first one of an unfinished run.
+    """The model of a run; waits for the first one of an unfinished run, or for its photographs.
 
     Raises:
         MivolError: a finished or stopped run without a model.
@@ -107,7 +108,7 @@ def wait_for_run(folder: Path, say: Callable[[str], None]) -> Subject:
         record = read_record(folder)
         if record.status == "running" and os.nice(0) < POLITE:
             os.nice(POLITE - os.nice(0))
-        if find_model(folder) is not None:
+        if find_model(folder) is not None or (record.status == "running" and find_photographs(folder) is not None):
             return RunSubject(folder)
         if record.status != "running":
             raise refusal(folder, f"a {record.status} run without a model", "one with a model", "run mivol optimize again")
@@ -128,7 +129,7 @@ def find_model(folder: Path) -> tuple[Path, float] | None:
 
 
 class RunSubject(Subject):
-    """The newest model of a run.
+    """The newest model of a run, or the points of its photographs while there is none.
 
     Attributes:
         folder: run folder.
@@ -137,13 +138,22 @@ class RunSubject(Subject):
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.name, self._time = folder, folder.resolve().name, 0.0
-        self.refresh()
         self.survey = find_photographs(folder)
+        if not self.refresh():
+            self.model: Subject = PhotoSubject(folder, self.survey)
+            # The sliders stay when the model comes; fits of photographs have models that can be cropped.
+            self.home, self.box, self.can_crop = self.model.home, self.model.box, True
+
+    @property
+    def title(self) -> str:
+        return self.name if self._time else f"{self.name}: no model yet"
 
     def draw(self, camera: Camera, look: Look, seed: int = 0) -> np.ndarray:
         return self.model.draw(camera, look, seed)
 
     def save_crop(self, folder: Path, box: Sequence[float]) -> Path:
+        if not self._time:
+            raise MivolError(f"{self.name} has no model yet: wait for the first one of the fit.")
         return self.model.save_crop(folder, box)
 
     def first_look(self) -> Look:
@@ -163,13 +173,17 @@ class RunSubject(Subject):
 
 
 def find_photographs(folder: Path) -> PhotoSurvey | None:
-    """The photographs of a run, by the settings in its checkpoint; None if they are not found from here.
+    """The photographs of a run; None if the run has none, or if they are elsewhere (``--photos`` names them then).
 
-    A record names no folders, and a path of the settings may start at the folder of a TOML file: ``--photos`` names them then.
+    Raises:
+        MivolError: a damaged list, or damaged photographs.
     """
-    file = folder / CHECKPOINT
-    settings = checkpoint.read_settings(file) if file.is_file() else {}
-    path = settings.get("photos.path")
-    if not path or find_format(Path(path)) is None:
+    file = folder / PHOTOGRAPHS
+    if not file.is_file():
         return None
-    return survey_views(Path(path), int(settings.get("photos.held_out") or 0), int(settings.get("photos.fold") or 0))
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+        path, held_out, fold = folder / found["path"], int(found["held_out"]), int(found["fold"])
+    except (ValueError, TypeError, KeyError) as error:
+        raise refusal(file, f"a damaged file ({error})", "the place of photographs", "remove it") from error
+    return None if find_format(path) is None else survey_views(path, held_out, fold)

@@ -96,6 +96,11 @@ class Subject(ABC):
         """Read again what has changed on disk; return whether the pictures change."""
         return False
 
+    @property
+    def title(self) -> str:
+        """Name on the page, with what is missing."""
+        return self.name
+
     def first_look(self) -> Look:
         """The look with which the sliders begin."""
         return Look()
@@ -271,8 +276,8 @@ class SceneSubject(Subject):
 class PhotoSubject(Subject):
     """Posed photographs: their cameras, and the points of a reconstruction if there are some."""
 
-    def __init__(self, path: Path) -> None:
-        self.survey = survey_views(path)
+    def __init__(self, path: Path, survey: PhotoSurvey | None = None) -> None:
+        self.survey = survey_views(path) if survey is None else survey
         self.name, self.box = path.name or "photographs", np.asarray(self.survey.box, np.float64)
         self.home = find_home_view([frame.camera for frame in self.survey.frames], self.box)
         points = self.survey.points

@@ -15,7 +15,7 @@ from mivol.fields.field_files import FIELD_FORMATS, read_field, write_field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.surfaces import default_level, extract_surface
 from mivol.files import encode_srgb, read_volume
-from mivol.files.mesh import Mesh, read_ply, write_mesh
+from mivol.files.mesh import Atlas, Mesh, read_ply, write_mesh
 from scenes import centred, rotation
 
 RADIUS = 0.6
@@ -85,6 +85,14 @@ def test_colours_are_those_seen_from_outside(variant_rgb: None) -> None:
     assert mesh.colours[:, 0] == pytest.approx(red, abs=1e-5)
     assert mesh.colours[:, 1] == pytest.approx(np.full(len(red), 0.5 + 0.28209479 * 0.3), abs=1e-6)
     assert np.ptp(mesh.colours[:, 0]) > 0.4
+
+
+def test_a_texture_has_the_colours_of_the_corners(variant_rgb: None) -> None:
+    """The texel at a corner has the colour of its point, to half a step of 8 bits."""
+    mesh = extract_surface(ball(), 4.0, textured=True)
+    corners = Atlas.of(len(mesh.faces)).corners().reshape(-1, 2)
+    column, row = (corners * mesh.texture.shape[1::-1]).astype(int).T
+    assert np.abs(mesh.texture[row, column] / 255 - np.clip(mesh.colours[mesh.faces.ravel()], 0, 1)).max() <= 0.5 / 255 + 1e-6
 
 
 def test_a_sparse_field_has_the_surface_of_the_dense_one(variant_rgb: None) -> None:

@@ -5,6 +5,7 @@ Tolerances are half a step of each format; the readers are tested by encoders of
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import subprocess
@@ -14,16 +15,19 @@ import browser
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import PIL.Image
 import pytest
 from browser import start_browser
 from gaussian_sets import random_gaussians
+from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from mivol.errors import MivolError
 from mivol.experiments.render import make_camera
+from mivol.fields.surfaces import interpolate_corners
 from mivol.files.gltf import read_accessor, read_glb, turn_to_y
 from mivol.files.image_files import decode_srgb
-from mivol.files.mesh import Mesh, write_mesh
+from mivol.files.mesh import Atlas, Mesh, write_mesh
 from mivol.photos.camera_path import HomeView
 from mivol.points import Gaussians, read_gaussians, write_gaussians
 from mivol.points.gaussian_gltf import turn
@@ -152,6 +156,35 @@ def test_a_mesh_keeps_its_colours_as_linear_light_and_its_up(tmp_path: Path) -> 
         x, y, z, w = turn_to_y(up)
         axis, v = np.array([x, y, z]), np.array(up) / np.linalg.norm(up)
         assert np.allclose(v + 2 * np.cross(axis, np.cross(axis, v) + w * v), [0, 1, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 40])
+def test_a_texture_of_a_glb_is_linear_in_each_triangle(tmp_path: Path, count: int) -> None:
+    """Random colours at the corners: linear interpolation between texels, as of a graphics card, gives their linear mean in the
+    whole triangle. Texels are rounded to 8 bits; positions are in float32, an error of 2^-24 of up to 40 texels."""
+    rng = np.random.default_rng(count)
+    points, colours = rng.normal(size=(3 * count, 3)), rng.uniform(0.35, 0.65, (3 * count, 3))
+    faces = rng.permutation(3 * count).reshape(-1, 3)
+    atlas = Atlas.of(count)
+    image = atlas.paint(lambda numbers, weights: interpolate_corners(colours, faces[numbers], weights))
+    write_mesh(tmp_path / "a.glb", Mesh(points, faces, colours=colours, texture=image))
+    document, data = read_glb(tmp_path / "a.glb")
+    primitive, view = document["meshes"][0]["primitives"][0], document["bufferViews"][document["images"][0]["bufferView"]]
+    assert "COLOR_0" not in primitive["attributes"]  # glTF multiplies it with the texture
+    packed = data[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    texels = np.asarray(PIL.Image.open(io.BytesIO(packed)), np.float64) / 255
+    names = primitive["attributes"]
+    uv, stored = (read_accessor(tmp_path / "a.glb", document, data, names[name]) for name in ("TEXCOORD_0", "POSITION"))
+    corners = read_accessor(tmp_path / "a.glb", document, data, primitive["indices"]).reshape(-1, 3)
+    assert np.allclose(stored[corners], points[faces])
+    weights = rng.dirichlet([0.5] * 3, (count, 50))
+    places = np.einsum("npc,ncd->npd", weights, uv[corners]).reshape(-1, 2) * texels.shape[1::-1] - 0.5
+    nodes = np.clip(places[:, ::-1].T, 0, np.array(texels.shape[:2])[:, None] - 1)
+    shown = np.stack([map_coordinates(channel, nodes, order=1) for channel in np.moveaxis(texels, 2, 0)], axis=1)
+    expected = np.einsum("npc,ncd->npd", weights, colours[faces]).reshape(-1, 3)
+    assert np.abs(shown - expected).max() <= 0.5 / 255 + 1e-4
+    with pytest.raises(MivolError, match="--resolution"):
+        Atlas.of(3_000_000)
 
 
 # -- SOG -----------------------------------------------------------------------------------------------------------------

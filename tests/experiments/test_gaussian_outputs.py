@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,8 +16,10 @@ from mivol.experiments import gaussian_conversion, photo_fit
 from mivol.experiments import gaussian_fit as outputs
 from mivol.experiments.film import Film
 from mivol.experiments.fit_kind import NullProgress
+from mivol.fields.surfaces import DepthView, interpolate_corners
 from mivol.files.gltf import read_glb, turn_to_y
-from mivol.files.mesh import Mesh
+from mivol.files.mesh import Atlas, Mesh
+from mivol.photos import Camera, pixel_centres, rays
 from mivol.photos.camera import project
 from mivol.photos.camera_path import HomeView
 from mivol.points import Gaussians, write_gaussians
@@ -78,12 +81,42 @@ def test_gaussians_become_a_scene(variant_rgb: str, tmp_path: Path, has_view: bo
 def test_a_mesh_of_gaussians_is_upright_as_the_photographs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     triangle = Mesh(np.eye(3), np.array([[0, 1, 2]]))
     monkeypatch.setattr(gaussian_conversion, "mesh_of_gaussians", lambda *given: triangle)
+    monkeypatch.setattr(gaussian_conversion, "paint_mesh", lambda *given: np.zeros((8, 8, 3), np.uint8))
     monkeypatch.setattr(gaussian_conversion, "measure_mesh_error", lambda *given: gaussian_conversion.MeshLoss(0, 0, 0, 0))
     view = HomeView((0.6, -0.8, 0.0), (5.0, 0.0, -5.0), (5.0, 0.0, 0.0), 60.0, (960, 540))
     write_gaussians(tmp_path / "a.ply", cloud(), view)
     assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.glb"), "--to", "mesh"]) == 0
     document, _ = read_glb(tmp_path / "b.glb")
     np.testing.assert_allclose(document["nodes"][0]["rotation"], turn_to_y(view.up), atol=1e-9)
+
+
+def test_a_mesh_is_painted_by_the_views_that_see_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A square is red on the left and green on the right, and a near thing hides its upper half from all views, whose colour
+    there is that of the points. Two texels beside a border may mix."""
+
+    def views_of(cloud: None, cameras: list[Camera]) -> Iterator[DepthView]:
+        for camera in cameras:
+            o, d = rays(camera, pixel_centres(camera.size))
+            t = (0.5 - o[..., 2]) / d[..., 2]
+            p = o + t[..., None] * d
+            hidden = p[..., 1] > 0.5
+            colour = np.where(hidden[..., None], [0, 0, 1.0], np.where(p[..., :1] < 0.5, [1.0, 0, 0], [0, 1.0, 0]))
+            depth = t * (d @ -camera.to_world[:3, 2])
+            yield DepthView(camera, np.where(hidden, 0.5, 1) * depth, colour)
+
+    monkeypatch.setattr(gaussian_conversion, "_splat_depths", views_of)
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)))
+    number = np.arange(81).reshape(9, 9)
+    a, b, c, d = number[:-1, :-1].ravel(), number[:-1, 1:].ravel(), number[1:, :-1].ravel(), number[1:, 1:].ravel()
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([b, d, c], axis=1)])
+    mesh = Mesh(np.stack([x, y, np.full(81, 0.5)], axis=1), faces, colours=np.full((81, 3), 0.2))
+    image = gaussian_conversion.paint_mesh(None, mesh, np.zeros(3), np.ones(3), 32)
+    atlas = Atlas.of(len(faces))
+    places = atlas.paint(lambda numbers, weights: interpolate_corners(mesh.points, faces[numbers], weights))[..., :2] / 255
+    served = atlas.paint(lambda numbers, weights: np.ones((len(numbers), len(weights), 3)))[..., 0] > 0
+    far = served & (np.abs(places - 0.5) > 0.1).all(axis=-1)
+    expected = np.where(places[..., 1:] > 0.5, 51, np.where(places[..., :1] < 0.5, [255, 0, 0], [0, 255, 0]))
+    assert far.sum() > 2000 and np.abs(image[far].astype(int) - expected[far]).max() <= 1
 
 
 def test_a_picture_stands_before_a_colour() -> None:

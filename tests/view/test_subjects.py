@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from photo_sets import write_transforms
 
 from mivol.errors import MivolError
 from mivol.experiments.render import make_camera
-from mivol.experiments.run_folder import NEWEST
+from mivol.experiments.run_folder import NEWEST, PHOTOGRAPHS, RunFolder
 from mivol.fields.field_files import read_field, write_field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_volume, write_volume
@@ -99,6 +100,24 @@ def test_a_run_shows_its_newest_model_and_reads_it_again(tmp_path: Path) -> None
     two_balls(tmp_path / "gaussians.ply")
     assert subject.refresh() and not subject.has_values and subject.can_crop
     assert subject.draw(CAMERA, Look()).max() > 0.5
+
+
+def test_a_run_shows_its_photographs_before_it_has_a_model(tmp_path: Path) -> None:
+    """The path in the folder starts at the folder; the first model replaces the points and keeps the cameras."""
+    (tmp_path / "photos").mkdir()
+    write_transforms(tmp_path / "photos", {"fl_x": 10.0, "w": 12, "h": 8})
+    run = RunFolder(tmp_path / "runs" / "a", RunRecord.new("a run"))
+    write_record(run.record, run.path)
+    run.write_photographs(tmp_path / "photos", 4, 1)
+    assert str(tmp_path) not in (run.path / PHOTOGRAPHS).read_text(encoding="utf-8")
+    subject = open_subject(run.path)
+    assert [frame.split == "train" for frame in subject.survey.frames] == [True, False, True, True]
+    assert not subject.draw(CAMERA, Look()).any() and "no model" in subject.title
+    with pytest.raises(MivolError, match="no model yet"):
+        subject.save_crop(tmp_path, LEFT)
+    two_balls(run.path / "gaussians.ply")
+    assert subject.refresh() and subject.title == "a"
+    assert subject.draw(CAMERA, Look()).max() > 0.5 and len(subject.survey.frames) == 4
 
 
 def test_foreign_paths_are_refused_in_a_sentence(tmp_path: Path) -> None:
