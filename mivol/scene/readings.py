@@ -49,6 +49,7 @@ class GridReading:
     Attributes:
         bounds: largest value of each block; of a sparse grid, whether the block is occupied.
         extremes: smallest and largest values of each block; None of a sparse grid.
+        pattern: whether each block has a positive value, eight blocks a byte; None of a sparse grid.
         occupied: share of blocks with a positive value [1].
         maximum: largest value of the grid.
         floored: values with 0 in place of negative values; None without negative values.
@@ -59,6 +60,7 @@ class GridReading:
     maximum: float
     floored: mi.Float | None = None
     extremes: BlockExtremes | None = None
+    pattern: bytes | None = None
 
 
 def _read_once(survey: SceneSurvey, kind: tuple, array: mi.Float, make: Callable[[], Any]) -> Any:
@@ -119,7 +121,9 @@ def read_extinction(part: ExactExtinction, survey: SceneSurvey, name: str) -> Gr
             extremes, low, high = extremes.floor(), np.maximum(low, 0), np.maximum(high, 0)
         _check_look_up(part, survey, name)
         bounds = np.maximum(-low, high).max(axis=0)
-        return GridReading(extremes.bounds, float((bounds > 0).mean()), float(bounds.max()), floored, extremes)
+        filled = bounds > 0
+        pattern = np.packbits(filled).tobytes()
+        return GridReading(extremes.bounds, float(filled.mean()), float(bounds.max()), floored, extremes, pattern)
 
     reading = _read_once(survey, ("part",), array, make)
     if reading.floored is not None:
@@ -275,11 +279,20 @@ def read_part(
 
 
 def read_empty_distances(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.UInt32:
-    """Measure the distance of each block to the nearest occupied block, once for each state of the array."""
-    array, res = dr.detach(part.lattice.values.array), part.lattice.res
-    return _read_once(
-        survey, ("empty distances",), array, lambda: find_distances_of_bounds(read_extinction(part, survey, name).bounds, res)
-    )
+    """Measure the distance of each block to the nearest occupied block, once for each pattern of occupied blocks: steps of a
+    fit seldom change it."""
+    array, res, place = dr.detach(part.lattice.values.array), part.lattice.res, (name, part.name)
+
+    def make() -> mi.UInt32:
+        reading = read_extinction(part, survey, name)
+        if reading.pattern is None or is_recording():
+            return find_distances_of_bounds(reading.bounds, res)
+        key = res, reading.pattern
+        if place not in survey.distances or survey.distances[place][0] != key:
+            survey.distances[place] = key, find_distances_of_bounds(reading.bounds, res)
+        return survey.distances[place][1]
+
+    return _read_once(survey, ("empty distances",), array, make)
 
 
 def read_block_ranges(part: ExactExtinction, survey: SceneSurvey, name: str) -> BlockRanges:

@@ -55,13 +55,18 @@ class SceneState:
     differentiated: list[tuple[str, mi.Object]] = field(default_factory=list)
 
     @classmethod
-    def of(cls, scene: mi.Scene, sensor: mi.Sensor) -> SceneState:
-        """Read the state of a scene and of the sensor to render, which may lie outside of the scene."""
-        state = cls(sensor)
+    def of(cls, scene: mi.Scene, sensor: mi.Sensor, attached: list[Any] | None = None) -> SceneState:
+        """Read the state of a scene and of the sensor to render, which may lie outside of the scene.
+
+        Args:
+            attached: list for the arrays, and the matrices of transforms, of the scene with gradients enabled. The state itself
+                holds none: it would keep the derivatives of an earlier step.
+        """
+        state, attached = cls(sensor), [] if attached is None else attached
         params = traverse(scene)
-        state.differentiated = state._add(params)
+        state.differentiated = state._add(params, attached)
         if sensor not in params.hierarchy:
-            state._add(traverse(sensor))
+            state._add(traverse(sensor), [])
         state.others.append(_describe_sensor(sensor))
         return state
 
@@ -86,8 +91,8 @@ class SceneState:
         numbers, others = ([value[:2] for value in state.values] for state in (self, other))
         return self.sensor is other.sensor and numbers == others and self.others == other.others
 
-    def _add(self, params: mi.SceneParameters) -> list[tuple[str, mi.Object]]:
-        """Add parameters; returns the keys with gradients enabled, and their owners."""
+    def _add(self, params: mi.SceneParameters, attached: list[Any]) -> list[tuple[str, mi.Object]]:
+        """Add parameters; returns the keys with gradients enabled, and their owners, and appends their arrays."""
         differentiated = []
         for key in params.properties:
             _, _, owner, _ = params.properties[key]
@@ -102,6 +107,7 @@ class SceneState:
             (self.values if _is_followed(owner, key) else self.others).append(state)
             if state[2]:
                 differentiated.append((key, owner))
+                attached.append(numbers)
         return differentiated
 
 
@@ -130,12 +136,6 @@ def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:
     owners = ((key, params.properties[key][2], value) for key, value in list_values(params))
     lost = [key for key, owner, value in owners if find_gradient_array(value) is not None and not _is_followed(owner, key)]
     return f"a recording does not follow the derivative by {lost[0]}" if lost else None
-
-
-def find_differentiated(scene: mi.Scene) -> list[Any]:
-    """The arrays, and the matrices of transforms, with gradients enabled among the parameters of a scene."""
-    found = (find_gradient_array(value) for _, value in list_values(traverse(scene)))
-    return [array for array in found if array is not None]
 
 
 def find_gradient_array(value: Any) -> Any | None:

@@ -11,7 +11,7 @@ reads them. Extinction needs neither: transport reads extinction from the parame
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -39,7 +39,7 @@ from mivol.scene.render_tasks import (
     prepare_placements,
     zero_radiance,
 )
-from mivol.scene.scene_state import SceneState, find_differentiated, find_gradient_array
+from mivol.scene.scene_state import SceneState, find_gradient_array
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.stand_in import StandIn, reset_sampler
 from mivol.scene.survey import SceneSurvey, survey_scene
@@ -143,9 +143,10 @@ class Session:
         with without_garbage_collection():
             with dr.resume_grad():
                 recompute_derived(scene)
-                state = SceneState.of(scene, sensor)
+                attached: list[Any] = []
+                state = SceneState.of(scene, sensor, attached)
                 opened = self._open(scene, sensor, spp, state, for_images=False)
-            self._run(GradientTask, opened, scene, sensor, _opaque_seed(seed), grad_in)
+            self._run(GradientTask, opened, scene, sensor, _opaque_seed(seed), grad_in, attached=attached)
 
     def sample(self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool) -> tuple:
         """Estimate the radiance along given rays, for integrators that nest this integrator and do not name a sensor."""
@@ -162,8 +163,20 @@ class Session:
             # An integrator that nests this integrator treats alpha as a mask: sample the mask with probability alpha.
             return score.L, sampler.next_1d(active) < alpha, integrate_aovs(media, ray, self.aovs, active)
 
-    def _run(self, kind: type[RenderTask], opened: PlannedScene, scene: mi.Scene, sensor: mi.Sensor, *inputs: Any) -> Any:
-        """Run a task: record it, replay its recording, or trace it if it cannot be recorded."""
+    def _run(
+        self,
+        kind: type[RenderTask],
+        opened: PlannedScene,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        *inputs: Any,
+        attached: Sequence[Any] = (),
+    ) -> Any:
+        """Run a task: record it, replay its recording, or trace it if it cannot be recorded.
+
+        Args:
+            attached: arrays to whose gradients the task adds.
+        """
 
         def make() -> RenderTask:
             return kind(opened, self.settings, self.aovs)
@@ -178,7 +191,7 @@ class Session:
             stand_in.show(sensor)
             given = (scene, stand_in.camera, *given[2:])
         self._reset(given[1])
-        gradients = [(value, dr.grad(value)) for value in find_differentiated(scene)] if kind is GradientTask else []
+        gradients = [(value, dr.grad(value)) for value in attached]
         try:
             found = self.recordings.call(kind, (opened.spp, *opened.key), make, *given)
             if stand_in is not None and kind is not GradientTask:

@@ -79,6 +79,7 @@ class SceneSurvey:
         scatters: whether each medium scattered at the last reading, by name.
         values, numbers: results of reading arrays and constants (:mod:`mivol.scene.readings`).
         reads: keys of the values that the previous render and the present one have read.
+        distances: distances of blocks to occupied blocks, with the pattern of these, by medium and part.
         places: placements of grids (:func:`mivol.transport.media.medium_view.view_medium`).
         cosines: mean cosines of phase functions, by the name of the medium.
         warned: media and grids with a warning already given.
@@ -100,6 +101,7 @@ class SceneSurvey:
     scatters: dict = field(default_factory=dict)
     values: dict = field(default_factory=dict)
     reads: list[set] = field(default_factory=lambda: [set(), set()])
+    distances: dict = field(default_factory=dict)
     places: dict = field(default_factory=dict)
     numbers: dict = field(default_factory=dict)
     cosines: dict = field(default_factory=dict)

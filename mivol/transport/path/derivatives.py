@@ -52,9 +52,11 @@ USUAL_NOISE = 0.15
 MAX_SORTED_LENGTH = 0xFFF
 """Largest number of scattering events told apart when branches are sorted by length."""
 
-MIN_PATHS, MAX_PATHS, RAYS_PER_PATH = 1 << 11, 1 << 15, 64
+RAYS_PER_PATH, FEW_PATHS, MAX_PATHS = 64, 1 << 11, 1 << 15
+MIN_PATHS, PATHS_PER_RAY = 1 << 8, 2
 """Number of paths estimating the baseline: one for 64 rays of a pass, within bounds. A rough estimate is enough, since
-derivatives are unbiased for any baseline."""
+derivatives are unbiased for any baseline. A pass of fewer rays than ``FEW_PATHS`` has two paths a ray. (16^2 rays of four
+scenes: 512 paths instead of 2048 raise the variance by at most 20 %, and take .5 to .84 of the time.)"""
 
 BASELINE_SEED = 0x1E7E1
 """Seed of these paths. They are independent of the paths of a render; otherwise the baseline would bias its derivatives."""
@@ -279,6 +281,12 @@ def prepare_derivatives(estimators: Estimators, ray: mi.Ray3f) -> None:
         segment.baseline = _estimate_baseline(estimators, ray)
 
 
+def count_baseline_paths(rays: int) -> int:
+    """Number of paths estimating the baseline of a pass of so many rays."""
+    fewest = min(max(PATHS_PER_RAY * rays, MIN_PATHS), FEW_PATHS)
+    return min(max(rays // RAYS_PER_PATH, fewest), MAX_PATHS)
+
+
 def _estimate_baseline(estimators: Estimators, ray: mi.Ray3f) -> Baseline | None:
     """Estimate the baseline from the collisions of some paths, walked twice.
 
@@ -292,7 +300,7 @@ def _estimate_baseline(estimators: Estimators, ray: mi.Ray3f) -> Baseline | None
 
     # -- Some rays of the pass -------------------------------------------------------------------------------------------
     n = dr.width(ray)
-    count = min(max(n // RAYS_PER_PATH, MIN_PATHS), MAX_PATHS)
+    count = count_baseline_paths(n)
     index = mi.UInt32(dr.arange(mi.UInt64, count) * n // count)
     rays = mi.Ray3f(ray)
     # Gathers need evaluated arrays: one evaluation of all, in place of a kernel for each.
