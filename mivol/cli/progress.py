@@ -95,9 +95,10 @@ class Display:
         for line in fit.log[self.logged :]:
             self.console.print(line, soft_wrap=True, highlight=False, markup=False)
         self.logged = len(fit.log)
-        self.bar.update(self.task, completed=fit.next_iteration, description=figures(fit, self.note()))
+        # Figures wait for the newest loss: read only to be shown.
         if self.console.is_terminal:
             if time.monotonic() - self.drawn > 0.1:
+                self.bar.update(self.task, completed=fit.next_iteration, description=figures(fit, self.note()))
                 self.bar.refresh()
                 self.drawn = time.monotonic()
         elif len(fit.evaluations) > self.printed:

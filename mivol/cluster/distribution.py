@@ -30,6 +30,7 @@ from mivol.experiments.scan_fit import ScanFit
 from mivol.experiments.scene_fit import SceneFit, make_integrator
 from mivol.files.fetch import PREFIX, resolve_path
 from mivol.optim.problem import Part, Problem, Reals, add_parts, to_arrays, to_tensors
+from mivol.optim.scenes.render_noise import RenderLoss, ViewLoss
 from mivol.optim.scenes.scene_problem import Linearization, SceneProblem, draw_views
 from mivol.optim.scenes.views import ADJOINT, PRIMAL, RenderBatch, View, count_pixels, make_batches, make_single_batches
 from mivol.report.record import Table
@@ -123,8 +124,8 @@ class SharedSceneProblem(SceneProblem):
         chosen = draw_views(iteration, len(self.views), views, self.seed) if views else None
         found = self.ask(GRADIENT, reals, iteration, chosen)
         loss = self.take_losses(found)
-        energy, gradients = self.through_priors_and_maps(reals, to_tensors(found))
-        return loss + energy, gradients
+        energies, gradients = self.through_priors_and_maps(reals, to_tensors(found))
+        return loss + math.fsum(float(energy[0]) for energy in energies), gradients
 
     def loss_value(self, reals: Reals, iteration: int) -> float:
         """f(u), without derivatives."""
@@ -166,8 +167,9 @@ class SharedSceneProblem(SceneProblem):
         names = sorted(name for name in found if name.startswith(f"{LOSS}/"))
         losses, noises, noisy = zip(*(found.pop(name).tolist() for name in names), strict=True)
         self.noisy = bool(noisy[0])
-        self.newest_loss = math.fsum(losses), math.nan if self.noisy and self.spp == 1 else math.fsum(noises)
-        return self.newest_loss[0]
+        views = [ViewLoss(mi.Float(loss), mi.Float(noise), 1.0) for loss, noise in zip(losses, noises, strict=True)]
+        self.newest_loss = RenderLoss(views, is_noise_known=not (self.noisy and self.spp == 1))
+        return math.fsum(losses)
 
 
 class SharedLinearization(Linearization):

@@ -55,7 +55,7 @@ from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import FINAL, HELD_OUT, RenderBatch, View, derive_seed, make_batches
 from mivol.report.cameras import draw_view_cameras
 from mivol.report.pixel_scale import is_preview_due
-from mivol.report.record import Image, PlanLine, Volume
+from mivol.report.record import Image, PlanLine, Volume, read_metrics
 from mivol.scene.explain import Explanation, describe_light, explain_scene, read_settings
 from mivol.scene.load import LoadedScene
 from mivol.scene.needs import find_needs
@@ -82,8 +82,10 @@ class SceneFit(FitKind):
         starts: parameters and their first values.
         integrator: integrator of the renders.
         references: images of the views.
+        n_rows: number of rows in the metrics; None before the first step.
     """
 
+    n_rows: int | None = None
     stages = Stages("scene", "fit", "images and volumes")
     first_row = 0
     settings: SceneExperiment
@@ -170,11 +172,19 @@ class SceneFit(FitKind):
         return {"scene": self.loaded.content_hash, "references": self.references.digest()}
 
     def after_step(self, fit: Fit, run: RunFolder, best: BestIterate) -> None:
-        last = fit.history[-1]
-        is_new = fit.evaluations and fit.evaluations[-1]["iteration"] == last["iteration"]
-        run.append(last["iteration"], last["seconds"], loss=last["loss"], **(fit.latest_errors() if is_new else {}))
+        self.append_rows(fit, fit.read_history, run)
         if is_preview_due(fit.next_iteration, self.settings.fit.iterations):
             self.show_volume(run)
+
+    def append_rows(self, fit: Fit, records: list[dict[str, float]], run: RunFolder) -> None:
+        """Add rows for the newest records of a fit, with the errors measured before their steps."""
+        if self.n_rows is None:
+            self.n_rows = len(read_metrics(run.path))
+        new, self.n_rows = records[self.n_rows :], len(records)
+        # At most one evaluation a record.
+        errors = {evaluation["iteration"]: evaluation for evaluation in fit.evaluations[-len(new) - 1 :]} if new else {}
+        for record in new:
+            run.append(**{**errors.get(record["iteration"], {}), **record})
 
     def show_volume(self, run: RunFolder) -> None:
         """Write the first fitted grid for a viewer; a fit of other parameters has none."""
@@ -184,6 +194,7 @@ class SceneFit(FitKind):
                 return
 
     def finish(self, fit: Fit, run: RunFolder) -> None:
+        self.append_rows(fit, fit.history, run)
         # Once, however often a finished run is resumed.
         run.rewind(fit.next_iteration - 1)
         if fit.evaluations and fit.evaluations[-1]["iteration"] == fit.next_iteration and len(fit.evaluations[-1]) > 2:

@@ -3,6 +3,9 @@
 Conventions. Iteration i depends on the problem, the optimizer's state and i only. A checkpoint holds the state before an
 iteration; Ctrl-C and SIGTERM save the state before the interrupted iteration. A resumed run therefore equals an uninterrupted
 run: bit for bit with one Dr.Jit thread, to about 1e-5 with several threads, whose float sums have no fixed order.
+
+Losses of quick steps are read several steps late: the host prepares the next step while the device computes. Slow steps are read
+at once, so that their arrays do not pile up.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import SupportsFloat
 
 import mitsuba as mi
 
@@ -27,6 +31,12 @@ from mivol.threads import check_one_thread
 
 SAVED_FIELDS = ("next_iteration", "events_done", "history", "evaluations", "log", "has_warned", "seconds")
 """Fields of a fit in a checkpoint, beside the arrays of the optimizer run and the problem."""
+
+QUICK_STEP = 0.02
+"""Time of a step [s] up to which losses are read late."""
+
+MAX_UNREAD = 8
+"""Most steps whose losses have not been read."""
 
 Measure = Callable[[Problem], dict[str, float]]
 """Error measures of the problem's model, by name."""
@@ -59,11 +69,12 @@ class Fit:
         checkpoint: file of the checkpoint; None writes no checkpoint.
         next_iteration: number of the next iteration, which equals the number of completed iterations.
         events_done: number of applied events of the next iteration.
-        history: records (iteration, loss, seconds) of the iterations.
+        read_history: records (iteration, loss, seconds) of the iterations whose losses have been read. The property ``history``
+            reads the others first, and waits for them.
         evaluations: records (iteration, seconds, ...) of the evaluations.
         log: messages of events, and a message about the noise of renders in the loss.
         has_warned: whether the log holds the message about noise.
-        seconds: time of the iterations [s], without interruptions.
+        seconds: time of the iterations [s], without interruptions; up to the last loss that was read.
     """
 
     problem: Problem
@@ -73,7 +84,7 @@ class Fit:
     checkpoint: CheckpointFile | None = None
     next_iteration: int = 0
     events_done: int = 0
-    history: list[dict[str, float]] = field(default_factory=list)
+    read_history: list[dict[str, float]] = field(default_factory=list)
     evaluations: list[dict[str, float]] = field(default_factory=list)
     log: list[str] = field(default_factory=list)
     has_warned: bool = False
@@ -81,6 +92,8 @@ class Fit:
 
     def __post_init__(self) -> None:
         self._events = checkpoints_first(self.course.events)
+        self._unread: list[_Unread] = []
+        self._begun, self._step_seconds = 0.0, math.inf
         if self.checkpoint is not None and self.checkpoint.resume:
             self.restore()
 
@@ -99,6 +112,20 @@ class Fit:
         return curve_html([row["loss"] for row in self.history], repr(self)) + views
 
     @property
+    def history(self) -> list[dict[str, float]]:
+        """Records (iteration, loss, seconds) of all iterations; waits for the newest losses.
+
+        Raises:
+            MivolError: as :meth:`read_losses`.
+        """
+        self.read_losses()
+        return self.read_history
+
+    @history.setter
+    def history(self, records: list[dict[str, float]]) -> None:
+        self.read_history = records
+
+    @property
     def is_done(self) -> bool:
         """Whether no iteration remains or the optimizer has stopped."""
         return self.next_iteration >= self.course.iterations or bool(self.run.stop_reason)
@@ -112,6 +139,7 @@ class Fit:
         """Measure and record the errors."""
         if self.measure is None:
             return
+        self.read_losses()
         self.problem.set_reals(self.run.reals)
         self.evaluations.append({"iteration": self.next_iteration, "seconds": self.seconds, **self.measure(self.problem)})
 
@@ -126,25 +154,44 @@ class Fit:
         """Apply the events of the next iteration, then take its step. An interrupted step changes nothing.
 
         Raises:
-            MivolError: the loss is not finite.
+            MivolError: the loss of this step, or of an earlier one that was not read yet, is not finite.
         """
         for number, event in enumerate(self._events):
             if number >= self.events_done and event.due(self.next_iteration):
                 self._apply(event)
                 self.events_done = number + 1
-        started = time.perf_counter()
+        if not self._unread:
+            self._begun = time.perf_counter()
         loss = self.run.step(self.next_iteration, self.course.schedule.factor(self.next_iteration, self.course.iterations))
         if loss is None:
             return
-        loss = _number(loss)
-        if not math.isfinite(loss):
-            raise MivolError(
-                f"the loss became {loss} in iteration {self.next_iteration}: lower the learning rate, or bound the parameters."
-            )
-        self.seconds += time.perf_counter() - started
-        self._warn()
-        self.history.append({"iteration": self.next_iteration, "loss": loss, "seconds": self.seconds})
+        seconds = self.seconds + time.perf_counter() - self._begun
+        self._unread.append(_Unread(self.next_iteration, loss, seconds, self.problem.warning))
         self.next_iteration, self.events_done = self.next_iteration + 1, 0
+        if isinstance(loss, float) or self._step_seconds > QUICK_STEP or len(self._unread) == MAX_UNREAD:
+            self.read_losses()
+
+    def read_losses(self) -> None:
+        """Wait for the losses of the newest steps, and record them.
+
+        Raises:
+            MivolError: a loss is not finite.
+        """
+        if not self._unread:
+            return
+        unread, self._unread = self._unread, []
+        for step in unread:
+            loss = float(step.loss[0]) if isinstance(step.loss, mi.Float) else float(step.loss)
+            if not math.isfinite(loss):
+                raise MivolError(
+                    f"the loss became {loss} in iteration {step.iteration}: lower the learning rate, or bound the parameters."
+                )
+            self._warn(step)
+            self.read_history.append({"iteration": step.iteration, "loss": loss, "seconds": step.seconds})
+        passed = time.perf_counter() - self._begun
+        self._step_seconds = passed / len(unread)
+        self.seconds += passed
+        self.read_history[-1]["seconds"] = self.seconds
 
     def complete(self, observer: Callable[[Fit], None] = lambda fit: None) -> Fit:
         """Take all remaining steps. The problem's model and the checkpoint hold the result afterwards.
@@ -175,14 +222,15 @@ class Fit:
         return self
 
     def _apply(self, event: Event) -> None:
+        self.read_losses()
         message = event.apply(self)
         self.log += [f"iteration {self.next_iteration}: {message}"] if message else []
 
-    def _warn(self) -> None:
+    def _warn(self, step: _Unread) -> None:
         """Log once that the noise of renders makes up a large share of the loss."""
-        message = "" if self.has_warned else self.problem.warning()
+        message = "" if self.has_warned else step.warning()
         if message:
-            self.log.append(f"iteration {self.next_iteration}: {message}")
+            self.log.append(f"iteration {step.iteration}: {message}")
             self.has_warned = True
 
     # -- On disk ------------------------------------------------------------------------------------------------------
@@ -191,6 +239,7 @@ class Fit:
         """Write the checkpoint, if the fit has a file."""
         if self.checkpoint is None:
             return
+        self.read_losses()
         problem = {f"problem/{name}": array for name, array in self.problem.pack(self.run.reals).items()}
         fields = {name: getattr(self, name) for name in SAVED_FIELDS}
         self.checkpoint.write(self.run.pack() | problem, {**fields, "iterations": self.course.iterations})
@@ -220,9 +269,21 @@ class Fit:
             )
 
 
-def _number(loss: float | mi.Float) -> float:
-    """The loss as a float; waits for Dr.Jit if necessary."""
-    return float(loss[0]) if isinstance(loss, mi.Float) else float(loss)
+@dataclass
+class _Unread:
+    """A step whose loss has not been read.
+
+    Attributes:
+        iteration: number of the step.
+        loss: perhaps still computed by the device.
+        seconds: time of the fit when the step was launched [s].
+        warning: tells the noise of the loss in words, or returns "".
+    """
+
+    iteration: int
+    loss: SupportsFloat | mi.Float
+    seconds: float
+    warning: Callable[[], str]
 
 
 def begin_fit(

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol, SupportsFloat, TypeAlias
 
 import mitsuba as mi
 import numpy as np
@@ -43,9 +43,10 @@ class Problem(Protocol):
     def values(self) -> dict[str, mi.TensorXf]:
         """Values of the model by parameter."""
 
-    def warning(self) -> str:
-        """A sentence about the noise of the latest loss, or ""."""
-        return ""
+    @property
+    def warning(self) -> Callable[[], str]:
+        """Function that returns a sentence about the noise of the latest loss, or ""; it may wait for the loss."""
+        return str
 
     def pack(self, reals: Reals) -> dict[str, np.ndarray]:
         """Inputs of the next step beside the reals, as the nodes of a sparse field.
@@ -63,8 +64,9 @@ class Problem(Protocol):
 class DifferentiableProblem(Problem, Protocol):
     """Additional methods for first-order optimizers."""
 
-    def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[float | mi.Float, Reals]:
-        """f(u) and its gradient. A loss of type ``mi.Float`` has width 1 and may still be waiting for evaluation.
+    def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[SupportsFloat | mi.Float, Reals]:
+        """f(u) and its gradient. A loss of type ``mi.Float`` has width 1. The loss may still be waiting for evaluation, unless it
+        is a ``float``.
 
         Args:
             reals: u.

@@ -106,7 +106,8 @@ class LbfgsRun(OptimizerRun):
 
     def step(self, iteration: int, factor: float) -> float:
         packing = Packing(self.problem, self.reals)
-        loss, gradients = self.problem.loss_and_gradient(self.reals, 0)
+        measured, gradients = self.problem.loss_and_gradient(self.reals, 0)
+        loss = float(measured)
         x, g = packing.vector(self.reals), packing.vector(gradients, 1)
         steps, changes = self._remember(x, g)
         free = packing.free(x, g)

@@ -46,7 +46,7 @@ def test_a_function_is_a_loss(scene: mi.Scene) -> None:
     for loss in (mean_square, L2()):
         problem = Problem(scene, [seen()], [KEY], loss=loss, spp=4)
         value, gradients = problem.loss_and_gradient(problem.initial_reals(), 0)
-        found.append((value, np.array(gradients[KEY])))
+        found.append((float(value), np.array(gradients[KEY])))
     assert np.isclose(found[0][0], found[1][0], rtol=1e-6)
     np.testing.assert_allclose(found[0][1], found[1][1], rtol=1e-5)
     assert np.abs(found[0][1]).max() > 0

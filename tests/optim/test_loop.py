@@ -228,7 +228,7 @@ def test_nonlinear_loss_is_independent_of_passes(variant_rgb) -> None:
         loss, gradients = problem.loss_and_gradient(problem.initial_reals(), 0)
         r = -0.8 - np.log(0.6)
         weight = 0.36 / (0.36 + 1e-6)
-        assert np.isclose(loss, weight * r**2, rtol=1e-5)
+        assert np.isclose(float(loss), weight * r**2, rtol=1e-5)
         assert np.isclose(np.asarray(gradients[KEY]).sum(), weight * 2 * r * -2.0, rtol=1e-5)
     losses = {}
     for spp, most in ((1, 1 << 20), (4, 3 * 64), (256, 1 << 20)):

@@ -36,25 +36,21 @@ NOTABLE = 0.05
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """The difference between a render and its reference.
-
-    The host reads loss and noise at the first access, which waits for the render.
+class ViewLoss:
+    """The loss of a render. The host reads mean and noise at the first access, which waits for the render.
 
     Attributes:
-        value: Float, ``loss`` on the device.
+        value: Float, ``mean`` on the device.
         bias: Float, the noise on the device without the weight; None for a single render.
         weight: factor on the noise.
-        adjoint: derivative of ``loss`` by the mean image.
     """
 
     value: mi.Float
     bias: mi.Float | None
     weight: float
-    adjoint: mi.TensorXf
 
     @cached_property
-    def loss(self) -> float:
+    def mean(self) -> float:
         """Mean penalty; without the render's noise if the loss takes pairs."""
         return float(self.value[0])
 
@@ -62,6 +58,57 @@ class Comparison:
     def noise(self) -> float:
         """Estimated contribution of the noise to the mean penalty of the mean image; 0 for a single render."""
         return 0.0 if self.bias is None else float(self.bias[0]) * self.weight
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The difference between a render and its reference.
+
+    Attributes:
+        view: mean penalty and its noise.
+        adjoint: derivative of ``loss`` by the mean image.
+    """
+
+    view: ViewLoss
+    adjoint: mi.TensorXf
+
+    @property
+    def loss(self) -> float:
+        """Mean penalty; waits for the render."""
+        return self.view.mean
+
+    @property
+    def noise(self) -> float:
+        """Noise in the mean penalty; waits for the render."""
+        return self.view.noise
+
+
+@dataclass(frozen=True)
+class RenderLoss:
+    """The loss of a fit, of its views and of its priors; ``float(loss)`` waits for the renders.
+
+    Attributes:
+        views: losses of the batches of views.
+        energies: energies of priors, arrays of one number.
+        is_noise_known: whether the noise of the renders was measured.
+    """
+
+    views: Sequence[ViewLoss] = ()
+    energies: Sequence[mi.Float] = ()
+    is_noise_known: bool = True
+
+    def __float__(self) -> float:
+        return self.of_views + math.fsum(float(energy[0]) for energy in self.energies)
+
+    @property
+    def of_views(self) -> float:
+        """The loss without the priors."""
+        return math.fsum(view.mean for view in self.views)
+
+    @property
+    def noise(self) -> float:
+        """Noise in the loss; nan if unknown."""
+        return math.fsum(view.noise for view in self.views) if self.is_noise_known else math.nan
 
 
 def compare_with_reference(
@@ -101,7 +148,7 @@ def compare_with_reference(
     value, adjoint = dr.detach(value), dr.detach(dr.grad(image))
     bias = None if bias is None else dr.detach(bias)
     dr.eval(value, bias, adjoint)
-    return Comparison(value, bias, weight, adjoint)
+    return Comparison(ViewLoss(value, bias, weight), adjoint)
 
 
 def split_samples(spp: int, loss: Loss) -> tuple[int, ...]:

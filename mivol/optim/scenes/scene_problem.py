@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import SupportsFloat
 
 import drjit as dr
 import mitsuba as mi
@@ -27,7 +28,14 @@ from mivol.optim.losses import L2, FunctionLoss, Loss, to_loss
 from mivol.optim.parameters import Parameter, as_tensor, check_names, find, like
 from mivol.optim.problem import LinearizableProblem, Reals, Refinement
 from mivol.optim.scenes.brick_stages import adapt_bricks, bricks_key, check_sparse_parameter
-from mivol.optim.scenes.render_noise import Comparison, compare_with_reference, describe_noise, make_noise_check, split_samples
+from mivol.optim.scenes.render_noise import (
+    Comparison,
+    RenderLoss,
+    compare_with_reference,
+    describe_noise,
+    make_noise_check,
+    split_samples,
+)
 from mivol.optim.scenes.views import (
     ADJOINT,
     PRIMAL,
@@ -64,7 +72,7 @@ class SceneProblem(LinearizableProblem):
         safe_point: called between kernels.
         noisy: whether images hold noise of sampled light, at the scene's present values.
         sparse: names of the parameters that are sparse grids.
-        newest_loss: loss of the views (no priors) and its noise, from the latest gradient.
+        newest_loss: loss of the latest gradient.
     """
 
     scene: mi.Scene
@@ -98,7 +106,7 @@ class SceneProblem(LinearizableProblem):
         self.loss = to_loss(self.loss)
         alone = isinstance(self.loss, FunctionLoss)
         self.batches = make_single_batches(self.views) if alone else make_batches(self.views, self.samples_per_pass)
-        self.newest_loss = (0.0, 0.0)
+        self.newest_loss = RenderLoss()
         self._has_noise = make_noise_check(self.integrator, self.scene)
         self.noisy = self._has_noise()
 
@@ -240,7 +248,7 @@ class SceneProblem(LinearizableProblem):
 
     # -- Loss and gradient ----------------------------------------------------------------------------------------
 
-    def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[float, Reals]:
+    def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[SupportsFloat, Reals]:
         """f(u) and its gradient over ``views`` views, drawn anew in each iteration; 0 takes all views.
 
         Image and derivative have independent seeds: an estimate of d(I^2) = 2 I dI from the same samples is biased.
@@ -256,8 +264,8 @@ class SceneProblem(LinearizableProblem):
         for index, batch in enumerate(batches):
             compared.append(self.compare(batch, self.seed_for(iteration, index, PRIMAL), n_views))
             self.vjp(batch.sensor, compared[-1].adjoint, self.seed_for(iteration, index, ADJOINT))
-        energy, gradients = self.through_priors_and_maps(reals, self.gradients())
-        return self.remember(compared) + energy, gradients
+        energies, gradients = self.through_priors_and_maps(reals, self.gradients())
+        return self.remember(compared, energies), gradients
 
     def rehearse(self) -> None:
         """Compute the derivative of the first batch, to raise errors of a first step early; the scene holds its start
@@ -305,11 +313,10 @@ class SceneProblem(LinearizableProblem):
             self.loss, renders, [n / self.spp for n in parts], batch.reference, batch.n_views / n_views
         )
 
-    def remember(self, compared: Sequence[Comparison]) -> float:
-        """Sum of the batches' losses, stored with the noise for :meth:`warning`."""
-        unknown = self.noisy and self.spp == 1
-        self.newest_loss = math.fsum(c.loss for c in compared), math.nan if unknown else math.fsum(c.noise for c in compared)
-        return self.newest_loss[0]
+    def remember(self, compared: Sequence[Comparison], energies: Sequence[mi.Float] = ()) -> RenderLoss:
+        """The sum of the batches' losses and of priors, stored for :meth:`warning`."""
+        self.newest_loss = RenderLoss([c.view for c in compared], energies, is_noise_known=not (self.noisy and self.spp == 1))
+        return self.newest_loss
 
     # -- Curvature ------------------------------------------------------------------------------------------------
 
@@ -330,22 +337,24 @@ class SceneProblem(LinearizableProblem):
         """The problem around ``reals``, with the random numbers of iteration 0."""
         return Linearization(self, reals)
 
-    def warning(self) -> str:
-        return describe_noise(self.loss, *self.newest_loss)
+    @property
+    def warning(self) -> Callable[[], str]:
+        loss, newest = self.loss, self.newest_loss
+        return lambda: describe_noise(loss, newest.of_views, newest.noise)
 
     def energy(self, reals: Reals) -> float:
         """Sum of weighted prior energies."""
         return math.fsum(float(p.energy(p.from_reals(dr.detach(reals[p.name])))[0]) for p in self.parameters)
 
-    def through_priors_and_maps(self, reals: Reals, gradients: Reals) -> tuple[float, Reals]:
-        """Prior energy, and the gradients by the reals for given gradients by the values."""
-        total, by_reals = 0.0, {}
+    def through_priors_and_maps(self, reals: Reals, gradients: Reals) -> tuple[list[mi.Float], Reals]:
+        """Energies of the priors, and the gradients by the reals for given gradients by the values."""
+        energies, by_reals = [], {}
         for p in self.parameters:
             u = mi.TensorXf(dr.detach(reals[p.name]))
             dr.enable_grad(u)
             value = p.from_reals(u)
             energy = p.energy(value)
-            total += float(dr.detach(energy)[0])
+            energies.append(dr.detach(energy))
             dr.set_grad(value, gradients[p.name])
             dr.enqueue(dr.ADMode.Backward, value)
             if dr.grad_enabled(energy):
@@ -353,8 +362,8 @@ class SceneProblem(LinearizableProblem):
                 dr.enqueue(dr.ADMode.Backward, energy)
             dr.traverse(dr.ADMode.Backward)
             by_reals[p.name] = dr.grad(u)
-        dr.eval(by_reals)
-        return total, by_reals
+        dr.eval(by_reals, energies)
+        return energies, by_reals
 
 
 class Linearization:
@@ -372,8 +381,8 @@ class Linearization:
         self.seeds = [problem.seed_for(0, index, PRIMAL) for index in range(len(problem.batches))]
         self.slopes = {p.name: p.map_derivative(reals[p.name]) for p in problem.parameters}
         self.loss, gradients = self.differentiate_images()
-        energy, self.gradient = problem.through_priors_and_maps(reals, gradients)
-        self.loss += energy
+        energies, self.gradient = problem.through_priors_and_maps(reals, gradients)
+        self.loss += math.fsum(float(energy[0]) for energy in energies)
 
     def differentiate_images(self) -> tuple[float, Reals]:
         """Loss of the images, and its derivative by the values."""
@@ -384,7 +393,7 @@ class Linearization:
             # The noise of an image and of a derivative from the same samples is correlated, which would bias J^T W r.
             own = problem.seed_for(0, index, ADJOINT) if problem.noisy else seed
             problem.vjp(batch.sensor, compared[-1].adjoint, own)
-        return problem.remember(compared), problem.gradients()
+        return float(problem.remember(compared)), problem.gradients()
 
     def curvature(self, direction: Reals) -> Reals:
         """(J^T W J + R'') direction."""
