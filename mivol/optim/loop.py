@@ -4,8 +4,8 @@ Conventions. Iteration i depends on the problem, the optimizer's state and i onl
 iteration; Ctrl-C and SIGTERM save the state before the interrupted iteration. A resumed run therefore equals an uninterrupted
 run: bit for bit with one Dr.Jit thread, to about 1e-5 with several threads, whose float sums have no fixed order.
 
-Losses of quick steps are read several steps late: the host prepares the next step while the device computes. Slow steps are read
-at once, so that their arrays do not pile up.
+Losses of quick steps are read several steps late: the host prepares the next step while the device computes. Losses of slow
+steps are read at once, so that the arrays of several steps do not pile up.
 """
 
 from __future__ import annotations

@@ -14,11 +14,13 @@ from false_alarms import assert_precise, assert_same_mean, fresh
 from fit_scene import KEY, absorbing_scene, camera, film, frontal, small_problem, views_of_truth
 
 from mivol.errors import MivolError
+from mivol.optim import loop
 from mivol.optim.events import Evaluate, Upsample
 from mivol.optim.first_order import Adam, RMSprop
 from mivol.optim.interrupt import Interrupted, InterruptGuard
 from mivol.optim.loop import Course, reconstruct
 from mivol.optim.losses import Huber, Log
+from mivol.optim.optimizer import OptimizerRun
 from mivol.optim.optimizers import OPTIMIZERS
 from mivol.optim.parameters import Parameter
 from mivol.optim.priors import Laplacian, TotalVariation
@@ -400,9 +402,77 @@ def test_the_alpha_of_a_film_is_not_fitted(variant_rgb, references: str) -> None
         reals = problem.initial_reals()
         loss, gradient = problem.loss_and_gradient(reals, 0)
         curved = problem.linearize(reals).curvature({KEY: mi.TensorXf(np.ones((4, 4, 4, 1), np.float32))})
-        found[pixel_format] = loss, np.array(gradient[KEY]), np.array(curved[KEY])
+        found[pixel_format] = float(loss), np.array(gradient[KEY]), np.array(curved[KEY])
     for plain, with_alpha in zip(found["rgb"], found["rgba"], strict=True):
         # Threads add the 64 x 4 samples to 9 pixels each in any order: each addition rounds by 2^-24 of the sum.
         rounding = 64 * 4 * 9 * 2**-24 * np.abs(plain).max()
         np.testing.assert_allclose(with_alpha, plain, rtol=0, atol=rounding)
         assert np.abs(plain).max() > 0
+
+
+class LateLosses(SceneProblem):
+    """A problem without a scene, whose losses note when they are read."""
+
+    def __init__(self, losses: dict[int, float] | None = None) -> None:
+        self.losses, self.read, self.newest = losses or {}, [], -1
+
+    def initial_reals(self) -> dict:
+        return {}
+
+    @property
+    def warning(self):
+        iteration = self.newest
+        return lambda: f"noise of {iteration}" if iteration == 3 else ""
+
+
+class LateLoss:
+    def __init__(self, problem: LateLosses, iteration: int) -> None:
+        self.problem, self.iteration = problem, iteration
+
+    def __float__(self) -> float:
+        self.problem.read.append(self.iteration)
+        return self.problem.losses.get(self.iteration, 1.0)
+
+
+class LateRun(OptimizerRun):
+    def step(self, iteration: int, factor: float) -> LateLoss:
+        self.problem.newest = iteration
+        return LateLoss(self.problem, iteration)
+
+
+class Clock:
+    """A clock on which each look takes so many seconds."""
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds, self.now = seconds, 0.0
+
+    def perf_counter(self) -> float:
+        self.now += self.seconds
+        return self.now
+
+
+@pytest.mark.parametrize(("seconds", "read"), [(1e-3, [0, *range(1, 9)]), (1.0, list(range(12)))])
+def test_losses_of_quick_steps_are_read_late(
+    variant_rgb: str, monkeypatch: pytest.MonkeyPatch, seconds: float, read: list[int]
+) -> None:
+    """The first loss at once, then eight together; slow steps one by one. The history waits for all of them, and messages about
+    noise name the iteration of their loss."""
+    monkeypatch.setattr(loop, "time", Clock(seconds))
+    problem = LateLosses()
+    fit = loop.Fit(problem, LateRun(problem), Course(20))
+    for _ in range(12):
+        fit.advance()
+    assert problem.read == read
+    assert [row["iteration"] for row in fit.history] == list(range(12)) == problem.read
+    assert np.all(np.diff([row["seconds"] for row in fit.history]) >= 0)
+    assert fit.history[-1]["seconds"] == fit.seconds
+    assert fit.log == ["iteration 3: noise of 3"]
+
+
+def test_a_late_loss_that_is_not_finite_names_its_iteration(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop, "time", Clock(1e-3))
+    problem = LateLosses({3: np.nan})
+    fit = loop.Fit(problem, LateRun(problem), Course(20))
+    with pytest.raises(MivolError, match="the loss became nan in iteration 3:"):
+        fit.complete()
+    assert fit.next_iteration == 9
