@@ -22,7 +22,7 @@ from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.flights.baseline import BLOCKS, BaselineSums
 from mivol.transport.estimators.scores import Replay
 from mivol.transport.path import derivatives
-from mivol.transport.path.derivatives import count_branches, prepare_derivatives
+from mivol.transport.path.derivatives import count_baseline_paths, count_branches, prepare_derivatives
 from mivol.transport.path.estimators import Settings
 from scenes import ball_of, box_of, camera, grid_volume, medium, skip_recorded_grids_on_a_gpu, sky
 
@@ -244,6 +244,7 @@ def find_sums(emitter: dict, *interiors: dict, depth: int = 3, at: tuple = (0, M
     found: list[tuple] = []
     finish = BaselineSums.finish
     with dr.suspend_grad(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(derivatives, "MIN_PATHS", derivatives.FEW_PATHS)
         patch.setattr(BaselineSums, "finish", lambda sums: found.append((sums, finish(sums))) or found[0][1])
         needs = find_needs(scene, scene.sensors()[0], survey)
         plan = make_plan(needs, settings)
@@ -256,6 +257,11 @@ def find_sums(emitter: dict, *interiors: dict, depth: int = 3, at: tuple = (0, M
 def find_mean(*args: dict, **options: object) -> np.ndarray:
     """The mean of the baseline over all collisions."""
     return np.array(find_sums(*args, **options)[0][1].mean)
+
+
+def test_small_passes_have_few_paths_for_the_baseline():
+    """Two paths a ray from 256 up to 2048, then one for 64 rays, up to 32768."""
+    assert [count_baseline_paths(n) for n in (16, 256, 1 << 12, 1 << 20, 1 << 22)] == [256, 512, 2048, 1 << 14, 1 << 15]
 
 
 def test_baseline_in_a_white_furnace_is_the_light_of_the_sky():
