@@ -7,6 +7,7 @@ import asyncio
 import logging
 import multiprocessing
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,9 +19,10 @@ from tiny_experiment import refused, write_experiment
 
 from mivol import config
 from mivol.bench.studies.cluster import Network, Workload, best_workers, say_limit, step_seconds
+from mivol.cluster import distribution
 from mivol.cluster.address import ClusterSettings, is_loopback, parse_cluster
 from mivol.cluster.connection import _collect_failures, _connect, _connect_address, import_distributed
-from mivol.cluster.distribution import make_blocks
+from mivol.cluster.distribution import ClusterDistribution, make_blocks
 from mivol.cluster.packages import (
     decode_sensor,
     encode_sensor,
@@ -36,6 +38,9 @@ from mivol.cluster.sweep import WorkerProgress, has_absolute_paths, read_files, 
 from mivol.cluster.workplace import Facts, Failure, Workplace, find_facts
 from mivol.doctor import FAULT, Finding
 from mivol.errors import MivolError
+from mivol.experiments.field_fit import FieldFit
+from mivol.experiments.scan_fit import ScanFit
+from mivol.experiments.scene_fit import SceneFit
 from mivol.optim.scenes.views import View
 from mivol.report.sweep_page import SweepRow
 from mivol.scene.load import load_scene
@@ -395,6 +400,27 @@ def test_blocks_depend_on_the_views_only(variant_rgb: str, count: int, size: int
     sensor = mi.load_dict({"type": "perspective", "film": film})
     views = [View(f"{i}", sensor, mi.TensorXf(np.zeros((size, size, 3), np.float32))) for i in range(count)]
     assert [block.n_views for block in make_blocks(views, spp)] == blocks
+
+
+@pytest.mark.parametrize(("kind", "share"), [(SceneFit, "scene"), (ScanFit, "projector"), (FieldFit, "problem")])
+def test_each_kind_of_fit_has_its_part_on_the_workers(monkeypatch: pytest.MonkeyPatch, kind: type, share: str) -> None:
+    """Views of scenes, products of scans, views of photographs; the times are those of the part's steps."""
+    shared = []
+
+    def note(name: str, times: str) -> Callable:
+        steps = SimpleNamespace(times=times)
+        return lambda *given: shared.append((name, given)) or SimpleNamespace(steps=steps, times=times)
+
+    monkeypatch.setattr(distribution, "share_scene_problem", note("scene", "of a scene"))
+    monkeypatch.setattr(distribution, "share_projector", note("projector", "of a projector"))
+    monkeypatch.setattr(distribution, "share_problem", note("problem", "of a problem"))
+    monkeypatch.setattr(kind, "make_problem", lambda self: "a problem")
+    fit, workers = object.__new__(kind), ClusterDistribution("a pool")
+    fit.projector = "rays"
+    problem = workers.make_problem(fit)
+    given = {"scene": fit, "projector": "rays", "problem": "a problem"}[share]
+    assert shared == [(share, ("a pool", given))] and workers.times == f"of a {share}"
+    assert (problem == "a problem") == (share != "scene") and (fit.projector != "rays") == (share == "projector")
 
 
 def test_sums_in_float64_do_not_depend_on_their_order() -> None:

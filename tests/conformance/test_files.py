@@ -160,6 +160,10 @@ def test_nrrd_without_a_space(tmp_path: Path) -> None:
     np.testing.assert_allclose((volume.spacing, volume.origin), ((1.5, 2, 2.5), (0, 0, 0)), atol=1e-12)
     volume = read(tmp_path, "b.nrrd", made.nrrd(made.numbered(), **plain, axis_mins="9.25 19 28.75"))
     assert_volume(volume, made.numbered())
+    # NaN is an unknown number: a step of 1, and a centre at 0.
+    plain["spacings"] = "1.5 nan 2.5"
+    volume = read(tmp_path, "c.nrrd", made.nrrd(made.numbered(), **plain, axis_mins="9.25 19 nan"))
+    np.testing.assert_allclose((volume.spacing, volume.origin), ((1.5, 1, 2.5), (10, 19.5, 0)), atol=1e-12)
 
 
 @pytest.mark.parametrize("encoding", ["raw", "gzip"])

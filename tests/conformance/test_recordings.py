@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import gc
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -18,7 +19,14 @@ from scattering_scenes import PLACE, cases, close_up, mivol, point, rough_grid, 
 import scenes
 from mivol.bench.studies.steps import count_launches
 from mivol.errors import MivolError
-from mivol.kernel_recording import CannotRecordError, RecordedTask, Recordings, is_recording, without_garbage_collection
+from mivol.kernel_recording import (
+    CannotRecordError,
+    RecordedFunctions,
+    RecordedTask,
+    Recordings,
+    is_recording,
+    without_garbage_collection,
+)
 from mivol.scene import plan, render_tasks, scene_state, session
 from mivol.scene.scene_state import SceneState, find_hidden_arrays
 from mivol.scene.stand_in import FORMATS, StandIn, describe_kind
@@ -505,6 +513,32 @@ def test_a_recording_is_kept_by_its_key_and_the_oldest_is_dropped() -> None:
     assert [task.factor for task in made] == [2, 3, 4, 3]
     recordings.clear()
     assert call(2, 1.0) == 2 and len(made) == 5
+
+
+@dataclass
+class Scaled:
+    """An array beside a number."""
+
+    array: mi.Float
+    factor: float
+
+
+def scale(one: Scaled, others: tuple[np.ndarray, dict]) -> mi.Float:
+    return one.array * one.factor * float(others[0].sum()) + others[1]["shift"]
+
+
+def test_a_function_follows_its_arrays_and_is_recorded_anew_for_the_rest() -> None:
+    """Arrays in structures are inputs; numbers, NumPy arrays and sizes are part of what was recorded."""
+    recorded = RecordedFunctions()
+    calls = [(1.0, 2.0, 3.0, 4), (5.0, 2.0, 3.0, 4), (5.0, 7.0, 3.0, 4), (5.0, 7.0, 4.0, 4), (5.0, 7.0, 4.0, 6)]
+    counts = []
+    for value, factor, number, width in calls:
+        for shift in (0.5, 1.5):
+            arrays = (dr.full(mi.Float, x, width) for x in (value, shift))
+            one, rest = Scaled(next(arrays), factor), (np.array([number]), {"shift": next(arrays)})
+            assert np.allclose(recorded.call(scale, one, rest), value * factor * number + shift)
+        counts.append(recorded.count)
+    assert counts == [1, 1, 2, 3, 4]
 
 
 def test_an_interrupt_ends_a_recording() -> None:

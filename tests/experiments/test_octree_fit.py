@@ -17,6 +17,7 @@ from mivol.fields.field_files import read_field, write_field
 from mivol.fields.octree import Octree
 from mivol.files import decode_srgb, write_png
 from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.radiance_plan import PRESETS
 from mivol.photos.transforms import write_transforms
 
 
@@ -87,3 +88,19 @@ def test_an_octree_needs_one_box_and_a_known_background(photographs: Path) -> No
         make_octree_plan(config.load(toml(photographs, 'preset = "cpv"')))
     with pytest.raises(MivolError, match="srgb and the photographs are linear"):
         read_start(photographs / "grid.npz", "linear", 1.0)
+
+
+def test_settings_become_a_plan(photographs: Path) -> None:
+    """Effort counts for all steps; a start leaves out the grid; what is absent is the preset's."""
+    words = 'preset = "tiny"\neffort = 0.5\ndegree = 1\ntolerance = 0.25\nsteps = 9'
+    settings = config.load(toml(photographs, words))
+    plan = make_octree_plan(settings)
+    tiny, grid = PRESETS["tiny"], plan.grid
+    assert [stage.steps for stage in grid.stages] == [max(1, round(stage.steps * 0.5)) for stage in tiny.stages]
+    assert grid.epochs == tiny.epochs * 0.5 and (grid.degree, grid.few_degree) == (1, None)
+    assert (plan.recipe.depth, plan.recipe.keep_weight, plan.recipe.tolerance) == (0, 0.015, 0.25)
+    assert plan.leaves.steps == 5 and plan.grid_steps == grid.steps and plan.random_background == grid.random_background
+    small = make_octree_plan(config.load(toml(photographs, 'preset = "tiny"\nlongest = 16'))).grid
+    assert small.stages[-1].longest == 16 and not small.cubic and small.few_degree == tiny.few_degree
+    begun = make_octree_plan(config.load(toml(photographs, 'start = "grid.npz"\ndepth = 4')))
+    assert begun.grid is None and begun.recipe.depth == 4 and begun.grid_steps == 0 and begun.leaves.steps == 400

@@ -373,6 +373,9 @@ def test_motions_have_no_mean_and_survive_density_control(variant_rgb: str, view
     problem = problem_of(views, plan)
     reconstruct(problem, plan.optimizer, plan.course())
     assert problem.motions.shape == (8, 6)
+    rate = problem.learning_rates(3)["motions"]
+    problem.cameras = problem.cameras[:2]  # a camera moves in each second step, not in each eighth
+    assert problem.learning_rates(3)["motions"] == pytest.approx(2 * rate)
     assert np.abs(problem.motions).max() > 1e-4
     # 8 numbers of at most 0.05 are added in float32.
     assert np.abs(problem.motions.mean(axis=0)).max() < 1e-7
