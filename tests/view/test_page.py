@@ -139,7 +139,7 @@ def make_page(monkeypatch: pytest.MonkeyPatch, output: Path | None) -> Page:
     """A page of a volume that can be cropped."""
     view = HomeView((0.0, 0.0, 1.0), (0.0, 0.0, 9.0), (0.0, 0.0, 0.0), 90.0, (200, 100))
     subject = SimpleNamespace(
-        name="smoke", box=BOX, survey=None, has_values=True, can_crop=True, first_look=Look, first_view=lambda: view,
+        name="smoke", title="smoke, 1 m", box=BOX, survey=None, has_values=True, can_crop=True, first_look=Look, first_view=lambda: view,
         save_crop=lambda folder, crop: folder / "smoke-crop.npz", refresh=lambda: True
     )  # fmt: skip
     monkeypatch.setattr(module, "check_viser", lambda: None)
@@ -252,6 +252,6 @@ def test_a_crop_is_saved_and_faults_are_said(monkeypatch: pytest.MonkeyPatch, tm
     page.painter.fault = "the model is gone."
     page.step(0.0)
     assert page.server.handles["status"].content == "refused: the model is gone." and page.painter.fault == ""
-    page.subject.name = "later"
+    page.subject.title = "later"
     module.serve(page, iter([False, False, True]).__next__)
     assert page.server.handles["title"].content == "**later**" and not page.server.is_running
