@@ -139,8 +139,8 @@ def make_page(monkeypatch: pytest.MonkeyPatch, output: Path | None) -> Page:
     """A page of a volume that can be cropped."""
     view = HomeView((0.0, 0.0, 1.0), (0.0, 0.0, 9.0), (0.0, 0.0, 0.0), 90.0, (200, 100))
     subject = SimpleNamespace(
-        name="smoke", title="smoke, 1 m", box=BOX, survey=None, has_values=True, can_crop=True, first_look=Look, first_view=lambda: view,
-        save_crop=lambda folder, crop: folder / "smoke-crop.npz", refresh=lambda: True
+        name="smoke", title="smoke, 1 m", box=BOX, survey=None, has_values=True, can_crop=True, first_look=Look,
+        first_view=lambda: view, save_crop=lambda folder, crop: folder / "smoke-crop.npz", refresh=lambda: True
     )  # fmt: skip
     monkeypatch.setattr(module, "check_viser", lambda: None)
     monkeypatch.setattr(module, "start_server", lambda port, token: Server())
