@@ -20,6 +20,7 @@ from beamline_files import write_named, write_nxtomo
 from dicom_series import write_frames, write_series
 from dicom_views import write_angiography
 from gaussian_sets import compressed_bytes, in_buckets, inria_bytes, ksplat_bytes, random_gaussians, splat_bytes, spz_bytes
+from netcdf_files import write_classic, write_hdf5
 from photo_sets import write_blender, write_colmap, write_transforms
 from PIL import Image
 from volume_files import les, meta_head, mha, nifti, nrrd, nrrd_head, numbered, packed, pbrt, vol, vti, vtk
@@ -80,6 +81,11 @@ def _dicom_views(path: Path) -> None:
 
 def _series(folder: Path) -> None:
     write_series(folder, numbered()[..., 0].astype("i2"), names=["a.dcm", "b.dcm"])
+
+
+def _netcdf(write: Callable) -> Write:
+    axes = {name: ((name,), np.arange(n) + 0.5, {"units": "m"}) for name, n in zip("zyx", (2, 3, 4), strict=True)}
+    return lambda path: write(path, {**axes, "ql": (("time", "z", "y", "x"), numbered()[None, ..., 0], {"scale_factor": 2.0})})
 
 
 def _matlab(path: Path) -> None:
@@ -334,6 +340,8 @@ FILES: dict[str, tuple[str, Write, Read]] = {
     "les": (".txt", _bytes(les(_of(numbered()))), mivol.read_volume),
     "matlab": (".mat", _matlab, mivol.read_volume),
     "matlab hdf5": (".mat", _matlab_hdf5, mivol.read_volume),
+    "netcdf": (".nc", _netcdf(write_classic), mivol.read_volume),
+    "netcdf-4": (".nc", _netcdf(write_hdf5), mivol.read_volume),
     "raw": (".raw", lambda path: path.write_bytes(_raw()), lambda path: mivol.read_volume(path, shape=(2, 3, 4), dtype="f4")),
     "tiff": (".tif", _tiff(None), mivol.read_volume),
     "tiff zlib": (".tif", _tiff("zlib"), mivol.read_volume),

@@ -24,6 +24,7 @@ from mivol.files import (
     hdf5,
     metaimage,
     mrc,
+    netcdf,
     nifti,
     npy,
     nrrd,
@@ -73,6 +74,7 @@ def _is_metaimage(head: bytes) -> bool:
 _METAIMAGE = VolumeFormat("MetaImage", _is_metaimage, metaimage.read_metaimage)
 _NRRD = VolumeFormat("NRRD", _starts_with(nrrd.MAGIC), nrrd.read_nrrd)
 _HDF5 = VolumeFormat("HDF5", _starts_with(hdf5.MAGIC), hdf5.read_hdf5)
+_NETCDF = VolumeFormat("NetCDF", netcdf.is_netcdf, netcdf.read_netcdf)
 _MRC = VolumeFormat("MRC", mrc.is_mrc, mrc.read_mrc)
 _DICOM = VolumeFormat("DICOM", dicom.is_dicom, dicom.read_dicom)
 _TIFF = VolumeFormat("TIFF", tiff.is_tiff, tiff.read_tiff)
@@ -99,6 +101,9 @@ FORMATS: dict[str, VolumeFormat] = {
     ".txt": _LES,
     ".h5": _HDF5,
     ".hdf5": _HDF5,
+    ".nc": _NETCDF,
+    ".nc4": _NETCDF,
+    ".cdf": _NETCDF,
     ".mrc": _MRC,
     ".map": _MRC,
     ".rec": _MRC,
@@ -117,6 +122,7 @@ RAW_BYTES = "raw bytes"
 UNREAD: dict[str, tuple[Callable[[bytes], bool], str]] = {
     "an MRC file": (mrc.is_mrc, "name it .mrc"),
     "a DICOM file": (dicom.is_dicom, "describe or convert it by mivol explain and mivol convert"),
+    "a NetCDF file": (_starts_with(netcdf.CLASSIC[:3]), "name it .nc"),
     "a MATLAB file": (_starts_with(b"MATLAB"), "name it .mat"),
     "an HDF5 file": (_starts_with(hdf5.MAGIC), "name a volume .h5; explain and optimize find the data of a scan"),
     "a TIFF file": (tiff.is_tiff, "name it .tif, or the folder of a scan for explain and optimize"),
@@ -169,7 +175,7 @@ def read_volume(
     Args:
         path: file; the suffix selects the format, and the first bytes must agree. The folder, or a file, of a DICOM series;
             a folder of TIFF slices, or a Zarr.
-        dataset: name of the array in a file of several arrays (.npz, .vti, .vtk, .vdb, .nvdb, .h5, LES text); number or
+        dataset: name of the array in a file of several arrays (.npz, .vti, .vtk, .vdb, .nvdb, .h5, .nc, LES text); number or
             ``SeriesInstanceUID`` of a DICOM series; name of the slices, with "#" for numbers, in a folder of several kinds.
         frame: key of :data:`FRAMES`: "file" places the volume as in the header and refuses a degenerate box, "unit" puts the
             volume on the unit cube.

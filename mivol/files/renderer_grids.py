@@ -168,7 +168,7 @@ def read_les(path: Path, dataset: str | None = None) -> VolumeData:
     index = cells[:, :3].astype(int)
     if (index < 0).any() or (index >= size).any():
         raise refusal(path, f"the cell {index[(index >= size).any(1)][:1].tolist()}", f"within {size}", "correct it")
-    fields = {"extinction": _extinction(cells, path), "lwc": cells[:, 3], "reff": cells[:, 4]}
+    fields = {"extinction": water_extinction(cells[:, 3], cells[:, 4], path), "lwc": cells[:, 3], "reff": cells[:, 4]}
     name = select_dataset(path, dataset or "extinction", list(fields))
     grid = np.zeros(size[::-1])
     grid[index[:, 2], index[:, 1], index[:, 0]] = fields[name]
@@ -178,8 +178,12 @@ def read_les(path: Path, dataset: str | None = None) -> VolumeData:
     return VolumeData(to_values(grid, path), to_world, meta)
 
 
-def _extinction(cells: np.ndarray, path: Path) -> np.ndarray:
-    water, radius = cells[:, 3], cells[:, 4]
+def water_extinction(water: np.ndarray, radius: np.ndarray, path: Path) -> np.ndarray:
+    """Extinction [1/m] of liquid water content [g/m^3] in drops of an effective radius [um]; 0 where no radius is known.
+
+    Raises:
+        MivolError: water in drops of radius 0.
+    """
     if ((radius <= 0) & (water > 0)).any():
         raise refusal(path, "water of effective radius 0", "a radius above 0 in wet cells", "correct the file")
-    return np.divide(1.5 * water, radius, out=np.zeros_like(water), where=radius > 0)
+    return np.divide(1.5 * water, radius, out=np.zeros(np.shape(water)), where=radius > 0)
