@@ -202,10 +202,3 @@ def test_tables_hold_their_numbers(study: ModuleType, question: str, answer: dic
 
 def test_a_fit_that_was_not_made_has_no_figure() -> None:
     gpu.STUDY.draw({"hash": {}}, Path("nothing"))
-
-
-def test_axes_count_as_found_or_told() -> None:
-    """Within 0.2 columns, or within two standard deviations."""
-    rows = {k: {"error": e, "sigma": s} for k, (e, s) in enumerate([(-0.19, 0), (0.2, 0), (-0.39, 0.2), (0.39, 0.19)])}
-    answer = preparation.join_axes(preparation.PreparationSize(), rows)
-    assert (answer["count"], answer["found"], answer["found_or_told"]) == (4, 1, 2)
