@@ -32,6 +32,7 @@ def test_rows_hold_what_a_placed_gaussian_is() -> None:
     np.testing.assert_allclose(ours, truth, rtol=1e-5, atol=1e-4)
     np.testing.assert_allclose(rows[:, 12], 1 / (1 + np.exp(-cloud.opacity_logits)), rtol=1e-6)
     np.testing.assert_array_equal(rows[:, SCALE_COLUMN], 2.5)
+    assert GaussianField.channels == 1 and rows.shape[1] == ROW_SIZE  # one extinction, whatever the colours
 
 
 def test_a_value_is_at_most_the_bound_and_reaches_it_at_a_mean() -> None:

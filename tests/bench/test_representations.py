@@ -9,12 +9,14 @@ import drjit as dr
 import numpy as np
 import pytest
 from bench_figures import drawn
+from gaussian_sets import random_gaussians
 
 from mivol.bench import photo_fits
 from mivol.bench.studies import representations
 from mivol.bench.studies.representations import STUDY, RepresentationSize
 from mivol.fields.octree import Octree
 from mivol.fields.spherical_grid import SphericalGrid
+from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 
 
 def test_the_chair_is_left_out_where_it_is_not(
@@ -72,6 +74,14 @@ def test_all_fits_see_the_same_photographs(variant_rgb: str, tmp_path: Path) -> 
     assert len(lines) == 2 + len(answer) and f"| octree | {answer['octree']['psnr']:.2f} dB" in "\n".join(lines)
     STUDY.draw({"still_life": answer}, tmp_path / "a.png")
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_gaussians_are_counted_and_stored() -> None:
+    """A .ply holds 14 float32 of each Gaussian of degree 0, behind its header."""
+    problem = object.__new__(GaussianProblem)
+    problem.cloud = vars(random_gaussians(7, 0))
+    count, size = representations.store(problem)
+    assert count == 7 and 7 * 14 * 4 < size < 7 * 17 * 4 + 1000
 
 
 def test_nothing_is_drawn_of_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

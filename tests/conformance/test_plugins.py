@@ -5,12 +5,15 @@ from __future__ import annotations
 import subprocess
 import sys
 import textwrap
+from contextlib import nullcontext
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from mivol.errors import MivolError
+from mivol.fields import voxels
 from scenes import FRAMES, as_float32, box_of, camera, grid_volume, medium, refused, render, sky, tensor, transform
 
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono")
@@ -367,3 +370,13 @@ def test_update_may_change_the_resolution(variant):
     assert tuple(volume.resolution()) == (2, 2, 3)
     # A convex combination of equal numbers, rounded.
     assert np.abs(np.array(volume.eval_3(it)) - 0.7).max() <= 4 * 2.0**-24
+
+
+@pytest.mark.parametrize(("error", "agrees"), [(0.001, True), (0.02, False)])
+def test_the_inverse_of_a_sheared_box_may_err_as_float32_does(error: float, agrees: bool) -> None:
+    """The error of each edge counts beside its length: an edge of 1000 beside others of 1 may come back off by 1."""
+    to_world = np.array([[1.0, 1000.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    wrong = np.eye(4)
+    wrong[0, 1] = 1000 * error
+    with nullcontext() if agrees else pytest.raises(MivolError, match="do not agree; rotate about an axis of length 1"):
+        voxels._check_inverse(to_world, wrong @ np.linalg.inv(to_world), "to_world")

@@ -13,6 +13,7 @@ from octrees import random_octree
 from scattering_scenes import cases
 
 from mivol.errors import MivolError
+from mivol.experiments.script import explain
 from mivol.fields.field_files import read_field, write_field
 from mivol.fields.harmonics import decode_srgb_code
 from mivol.fields.hash_encoding import HashSizes
@@ -55,6 +56,14 @@ def test_parameters_and_their_shapes(variant_rgb: None) -> None:
     assert tuple(params[f"{KEY}.density"].shape) == (5, 6, 7, 1)
     assert tuple(params[f"{KEY}.sh"].shape) == (5, 6, 7, 4, 3)
     assert f"{KEY.rpartition('.')[0]}.scale" not in params
+
+
+def test_negative_values_add_nothing_to_the_optical_depth(variant_rgb: str) -> None:
+    """ReLU: at most 1 along the diagonal of the box of edge 2, whatever stands below 0."""
+    density, colours = np.full((4, 4, 4, 1), -5, np.float32), tensor(np.zeros((4, 4, 4, 1, 3), np.float32))
+    density[0, 0, 0] = 1
+    made = field(density=tensor(density), sh=colours, activation="relu")
+    assert f"optical depth at most {2 * 3**0.5:.3g}" in explain(scene(made))
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ import scipy.sparse.linalg
 from small_scan import GRID, VIEWS, Views, problem_for, run
 
 from mivol.cite import list_citations
+from mivol.optim.projections import iterative, linear_problems
 from mivol.optim.projections.iterative import _Counts
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SmoothedTV, SolverState, last_state
 from mivol.optim.projections.solvers import SOLVERS
@@ -325,3 +326,9 @@ def test_solver_explains_the_data(scan, name):
     assert states[-1].x.dtype == np.float64
     assert SOLVERS[name].promises
     assert list_citations(SOLVERS[name].cites)
+
+
+def test_every_block_of_a_step_stays_nonnegative(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(linear_problems, "BLOCK", 2)
+    x = np.ones(5)
+    assert [iterative._stays_nonnegative(x, -1.0001 * (np.arange(5) == k)) for k in (0, 3, 4, 5)] == [False, False, False, True]
