@@ -299,6 +299,10 @@ def can_reduce_levels(plan: RadiancePlan, photos: Photos) -> bool:
     return plan.fewer_levels and points is not None and len(points) >= FEWEST_POINTS
 
 
+SPREAD = "for two idle cores; up to three times as long if matter fills the box"
+"""What the time of steps depends on."""
+
+
 def explain_plan(plan: RadiancePlan, photos: Photos, batches: RayBatches) -> list[PlanLine]:
     """Return the choices of a plan with their reasons."""
     box, origins = photos.box, np.array([view.camera.origin for view in photos.views])
@@ -325,6 +329,7 @@ def explain_plan(plan: RadiancePlan, photos: Photos, batches: RayBatches) -> lis
         *explain_wide_lenses(photos),
         PlanLine(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find empty space"),
         explain_steps(plan),
+        PlanLine(choice=f"about {plan.minutes:.2g} minutes", reason=SPREAD),
         explain_sizes(plan, (width, height)),
         explain_degree(plan, len(photos.views)),
         explain_background(plan, photos),

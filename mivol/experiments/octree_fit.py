@@ -80,7 +80,7 @@ class OctreeFit(FieldFit):
         leaves = self.plan.leaves
         steps = PlanLine(
             choice=f"{leaves.steps} steps of the octree, photographs shrunk by {leaves.shrink}",
-            reason="field.steps times field.effort; the leaves stay in place",
+            reason=f"field.steps times field.effort; the leaves stay in place; about {leaves.minutes:.2g} minutes more",
         )
         size = "half a voxel" if not self.plan.recipe.depth else f"a cube's edge over 2^{self.plan.recipe.depth}"
         built = PlanLine(

@@ -128,6 +128,7 @@ def explain_sampled_plan(plan: SampledPlan, photos: Photos, batches: RayBatches)
             reason=why,
         ),
         PlanLine(choice=f"{plan.steps} steps", reason="field.effort"),
+        PlanLine(choice=f"about {plan.minutes:.2g} minutes", reason="for two idle cores; the number of steps is fixed"),
         PlanLine(choice="no field behind the box", reason=behind),
         *explain_wide_lenses(photos),
         PlanLine(choice=f"rays end at a transmittance of {plan.stop:g}", reason="largest neglected share of the light"),

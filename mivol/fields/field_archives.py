@@ -21,7 +21,7 @@ from mivol.fields.nerf import NerfField
 from mivol.fields.sampled_field import Region, SampledField
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import write_whole
-from mivol.files.npy import check_memory, read_archive
+from mivol.files.npy import check_arrays, check_memory, read_archive
 from mivol.files.source import refusal
 from mivol.photos.camera_path import HomeView
 
@@ -135,12 +135,13 @@ def parse_sampled_archive(name: str, arrays: dict[str, np.ndarray]) -> SampledFi
     missing = expected.keys() - arrays.keys()
     if missing:
         raise MivolError(f"{name} lacks {', '.join(sorted(missing))}; write it again.")
-    _check_arrays(name, arrays, expected)
+    check_arrays(name, arrays, expected)
     res = tuple(int(n) for n in arrays["res"])
     cells = math.prod(n + 1 for n in res)
     if min(res) < 1 or arrays["occupied"].shape != (-(-cells // 8),) or not arrays["step"] > 0:
         found = f"{arrays['occupied'].shape} bytes of occupied cells at steps of {float(arrays['step']):g}"
-        raise MivolError(f"{name} holds {found} for {cells} cells; write it again.")
+        wanted = f"({-(-cells // 8)},) bytes and a step above 0 are expected"
+        raise MivolError(f"{name} holds {found} for {cells} cells; {wanted}: write it again.")
     occupied = np.unpackbits(arrays["occupied"].astype(np.uint8))[:cells]
     region = Region(res, arrays["region_to_world"].astype(np.float64), mi.UInt8(occupied), float(arrays["step"]))
     numbers = [mi.Float(arrays[key].astype(np.float32).ravel()) for key in kind.parameter_names()]
@@ -188,14 +189,14 @@ def parse_archive(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
     missing = {"density", "sh", "res", "to_world", "activation", "offset", "clamp", "levels", "space"} - arrays.keys()
     if missing:
         raise MivolError(f"{name} lacks {', '.join(sorted(missing))}; write it again.")
-    _check_arrays(name, arrays, ARRAY_KINDS)
+    check_arrays(name, arrays, ARRAY_KINDS)
     _check_node_count(name, arrays)
     res, levels = tuple(int(n) for n in arrays["res"]), int(arrays["levels"])
     nodes = arrays.get("nodes")
     n, shape = levels * math.prod(res) if nodes is None else len(nodes), arrays["sh"].shape
     if arrays["density"].shape != (n,) or len(shape) != 3 or shape[0] != n or shape[2] != 3:
         found = f"{arrays['density'].shape} densities and {shape} harmonics"
-        raise MivolError(f"{name} holds {found} for {n} nodes; write it again.")
+        raise MivolError(f"{name} holds {found} for {n} nodes; ({n},) and ({n}, basis, 3) are expected: write it again.")
     if nodes is not None:
         _check_nodes(name, nodes, levels * math.prod(res))
     return SphericalGrid.from_rows(
@@ -210,17 +211,6 @@ def parse_archive(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
         levels=levels,
         space=str(arrays["space"]),
     )
-
-
-def _check_arrays(name: str, arrays: dict[str, np.ndarray], expected: dict[str, tuple[str, tuple | None]]) -> None:
-    for key, (kinds, shape) in expected.items():
-        array = arrays.get(key)
-        if array is None:
-            continue
-        if array.dtype.kind not in kinds or (shape is not None and array.shape != shape):
-            raise MivolError(f"{name} holds {key} of type {array.dtype} and shape {array.shape}; write it again.")
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise MivolError(f"{name} holds {key} with values that are not finite; write it again.")
 
 
 def _check_node_count(name: str, arrays: dict[str, np.ndarray]) -> None:

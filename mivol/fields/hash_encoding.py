@@ -96,6 +96,11 @@ class HashSizes:
         return Network((self.geometry + basis_size(self.degree), *[self.width] * self.colour_layers, 3))
 
     @property
+    def weights(self) -> int:
+        """Weights of both networks."""
+        return self.density_network.size + self.colour_network.size
+
+    @property
     def growth(self) -> float:
         """Cells of a level along an edge over those of the level before."""
         return (self.finest / self.coarsest) ** (1 / max(self.levels - 1, 1))
@@ -103,15 +108,14 @@ class HashSizes:
     def count_numbers(self, edges: np.ndarray) -> int:
         """Number of fitted numbers, in a box with the edges (x, y, z)."""
         rows = sum(level.rows for level in self.place_levels(edges))
-        return rows * self.features + self.density_network.size + self.colour_network.size
+        return rows * self.features + self.weights
 
     def describe(self, edges: np.ndarray) -> tuple[str, str]:
         """Levels in a box with the edges (x, y, z), and their numbers."""
-        weights = self.density_network.size + self.colour_network.size
-        numbers = self.count_numbers(edges) - weights
+        numbers = self.count_numbers(edges) - self.weights
         return (
             f"{self.levels} levels of {self.coarsest} to {self.finest} cells, {self.features} features each",
-            f"{numbers} numbers in at most {1 << self.log2_table} rows a level, and {weights} weights of networks",
+            f"{numbers} numbers in at most {1 << self.log2_table} rows a level, and {self.weights} weights of networks",
         )
 
     def place_levels(self, edges: np.ndarray) -> list[Level]:

@@ -106,6 +106,11 @@ class NerfSizes:
         return sum(out * (inputs + 1) for out, inputs in self.layers.values())
 
     @property
+    def weights(self) -> int:
+        """Weights that a sample passes: those of one network."""
+        return self.size
+
+    @property
     def networks(self) -> int:
         """Number of networks: the fine one comes first."""
         return 2 if self.coarse else 1

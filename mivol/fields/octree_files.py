@@ -26,7 +26,7 @@ from mivol.errors import MivolError
 from mivol.fields.harmonics import harmonic_degree
 from mivol.fields.octree import MAX_DEPTH, Octree, check_depth, edges_of
 from mivol.files import write_whole
-from mivol.files.npy import check_memory
+from mivol.files.npy import check_arrays, check_memory
 from mivol.files.source import refusal
 from mivol.photos.camera_path import HomeView
 
@@ -129,19 +129,19 @@ def parse_octree(name: str, arrays: dict[str, np.ndarray]) -> Octree:
     missing = KINDS.keys() - arrays.keys()
     if missing:
         raise MivolError(f"{name} lacks {', '.join(sorted(missing))}; write it again.")
-    for key, (kinds, shape) in KINDS.items():
-        array = arrays[key]
-        if array.dtype.kind not in kinds or (shape is not None and array.shape != shape):
-            raise MivolError(f"{name} holds {key} of type {array.dtype} and shape {array.shape}; write it again.")
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise MivolError(f"{name} holds {key} with values that are not finite; write it again.")
+    check_arrays(name, arrays, KINDS)
     depth = int(arrays["depth"])
-    check_depth(depth)
+    try:
+        check_depth(depth)
+        harmonic_degree(1 + len(np.atleast_1d(arrays["directional"])))
+    except MivolError as error:
+        raise MivolError(f"{name}: {error}") from None
     codes, sizes = _leaves_of(name, arrays["tree"], depth)
     n, constant, rest = len(codes), arrays["constant"], arrays["directional"]
     if arrays["density"].shape != (n,) or constant.shape != (3, n) or rest.ndim != 3 or rest.shape[1:] != (3, n):
         found = f"densities {arrays['density'].shape} and coefficients {constant.shape} and {rest.shape}"
-        raise MivolError(f"{name} holds {found} for {n} leaves; write it again.")
+        wanted = f"({n},), (3, {n}) and (basis - 1, 3, {n}) are expected"
+        raise MivolError(f"{name} holds {found} for {n} leaves; {wanted}: write it again.")
     check_memory(Path(name), 4 * n * (1 + 3 * (1 + len(rest))))
     density, sh = arrays["density"].astype(np.float32), np.concatenate([constant.astype(np.float32)[None], rest])
     step = arrays["step"]

@@ -77,6 +77,10 @@ class PointValues:
 class FieldSizes(Protocol):
     """Sizes of a field that is known at points: a frozen dataclass of integers."""
 
+    @property
+    def weights(self) -> int:
+        """Weights of the networks that a sample passes."""
+
     def count_numbers(self, edges: np.ndarray) -> int:
         """Number of fitted numbers, in a box with the edges (x, y, z)."""
 
@@ -174,7 +178,8 @@ class SampledField(ABC):
             found = dr.width(getattr(self, name))
             if found != math.prod(shape):
                 size = " x ".join(str(n) for n in shape)
-                raise MivolError(f"{name} has {found} numbers, expected {size} by the sizes of this {self.noun}.")
+                wanted = f"expected {size} by the sizes of this {self.noun}"
+                raise MivolError(f"{name} has {found} numbers, {wanted}: write the file again.")
 
     def parameters(self) -> dict[str, mi.TensorXf]:
         """Values by name."""

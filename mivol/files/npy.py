@@ -145,6 +145,33 @@ def read_archive(path: Path, only: str | None = None) -> dict[str, np.ndarray]:
         raise refusal(path, f"a damaged archive ({reason})", "a complete .npz", "write or copy it again") from error
 
 
+NUMBER_TYPES = {"f": "float", "i": "int", "u": "uint", "b": "bool", "U": "text"}
+"""NumPy's kinds of types, in words."""
+
+
+def check_arrays(name: str, arrays: dict[str, np.ndarray], expected: dict[str, tuple[str, tuple | None]]) -> None:
+    """Check types, shapes and numbers of arrays.
+
+    Args:
+        name: file name, for error messages.
+        arrays: contents of an archive; what is not in ``expected`` is not checked, and what is missing neither.
+        expected: array -> allowed kinds of NumPy types, and its shape; None for any shape.
+
+    Raises:
+        MivolError: another type or shape, or values that are not finite.
+    """
+    for key, (kinds, shape) in expected.items():
+        array = arrays.get(key)
+        if array is None:
+            continue
+        if array.dtype.kind not in kinds or (shape is not None and array.shape != shape):
+            wanted = " or ".join(NUMBER_TYPES[kind] for kind in kinds) + ("" if shape is None else f" and shape {shape}")
+            found = f"{key} of type {array.dtype} and shape {array.shape}"
+            raise MivolError(f"{name} holds {found}; type {wanted} is expected: write it again.")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise MivolError(f"{name} holds {key} with values that are not finite; write it again.")
+
+
 def check_memory(path: Path, size: int) -> None:
     """Refuse arrays larger than the free memory.
 

@@ -106,9 +106,15 @@ def arrays(**more: object) -> dict[str, np.ndarray]:
 
 WRONG_ARRAYS = {
     "sh": (None, "f lacks sh; write it again."),
-    "density": (np.ones(7, np.float32), "f holds (7,) densities and (8, 1, 3) harmonics for 8 nodes; write it again."),
-    "to_world": (np.eye(3), "f holds to_world of type float64 and shape (3, 3); write it again."),
-    "activation": (1, "f holds activation of type int64 and shape (); write it again."),
+    "density": (
+        np.ones(7, np.float32),
+        "f holds (7,) densities and (8, 1, 3) harmonics for 8 nodes; (8,) and (8, basis, 3) are expected: write it again.",
+    ),
+    "to_world": (
+        np.eye(3),
+        "f holds to_world of type float64 and shape (3, 3); type float and shape (4, 4) is expected: write it again.",
+    ),
+    "activation": (1, "f holds activation of type int64 and shape (); type text and shape () is expected: write it again."),
     "offset": (np.nan, "f holds offset with values that are not finite; write it again."),
     "res": ((2, 0, 2), f"f has a grid of 2 x 0 x 2 nodes; 1 to {MAX_NODES} in all are expected."),
     "levels": (-1, f"f has a grid of -1 x 2 x 2 x 2 nodes; 1 to {MAX_NODES} in all are expected."),
@@ -125,7 +131,9 @@ def test_a_file_of_a_field_holds_what_it_should(name: str) -> None:
 @pytest.mark.parametrize("sh", [(7, 1, 3), (8, 1, 4), (8, 3)])
 def test_harmonics_of_a_file_belong_to_its_nodes(sh: tuple[int, ...]) -> None:
     says = refusal_of(parse_archive, "f", arrays(sh=np.zeros(sh, np.float32)))
-    assert says == f"f holds (8,) densities and {sh} harmonics for 8 nodes; write it again."
+    assert (
+        says == f"f holds (8,) densities and {sh} harmonics for 8 nodes; (8,) and (8, basis, 3) are expected: write it again."
+    )
     large = arrays(res=(2048, 2048, 1024))
     assert refusal_of(_check_node_count, "f", large).startswith("f has a grid of 2048 x 2048 x 1024 nodes;")
 

@@ -71,6 +71,9 @@ def test_a_plan_in_words(kind: str, changes: dict, expected: dict) -> None:
     assert said["200 steps"] == "field.effort" and said["no field behind the box"] == "photos.background"
     for choice, reason in expected.items():
         assert reason in said[choice]
+    # 200 steps of 8192 samples: a few levels or a few thousand weights take 0.3 to 5 microseconds a sample.
+    minutes = next(float(choice.split()[1]) for choice in said if choice.endswith(" minutes"))
+    assert 0.3e-6 < minutes * 60 / (200 * 8192) < 5e-6
     own = lines[-1].choice
     assert own.startswith("about ") and "photographs 3, the fit " in own
     marked = sampled_fit.explain_sampled_plan(plan, photographs(np.ones((4, 4))), SimpleNamespace(bytes=0))

@@ -93,12 +93,22 @@ class SampledPlan:
         """All steps, with further events."""
         return Course(self.steps, events=more)
 
+    @property
+    def minutes(self) -> float:
+        """Estimated time of the fit on two cores that walk 25 million rays a second (``EACH_WEIGHT``) [min]."""
+        each = EACH_WEIGHT * self.sizes.weights + EACH_LEVEL * getattr(self.sizes, "levels", 0)
+        return self.steps * self.samples * each / 60
+
     def learning_rate(self, step: int) -> float:
         """Learning rate in a step."""
         passed = sum(step >= share * self.steps for share in (0.5, 0.75, 0.9))
         rise = min(1.0, 0.01 + 0.99 * step / self.warm_up) if self.warm_up else 1.0
         return self.rate * rise * self.decay**passed * self.fall ** (step / self.steps)
 
+
+EACH_WEIGHT, EACH_LEVEL = 2.2e-10, 7e-8
+"""Seconds that a sample of a step takes for a weight, and for a level of a hash grid, on two cores that walk 25 million rays a
+second in ``mivol bench optical_depth``. From the fits of ``mivol bench representations``, which take 0.75 to 1.2 of it."""
 
 HASH_GRIDS: dict[str, SampledPlan] = {
     "tiny": SampledPlan(HashSizes(levels=6, log2_table=13, finest=64, width=16), steps=200, samples=1 << 13, cells=24),
