@@ -230,7 +230,7 @@ def poses(arguments: argparse.Namespace) -> None:
     """Find the poses of a folder of photographs or of a video, and write them to FOLDER/sparse/0 for mivol optimize.
 
     COLMAP searches (pip install "mivol[poses]"); nothing is downloaded, and no GPU is needed. From a video, poses takes sharp
-    frames, with a moved camera between them, into a folder of the video's name. The same command continues after Ctrl-C.
+    frames, with parallax between them, into a folder of the video's name. The same command continues after Ctrl-C.
     """
     from mivol.photos import video
     from mivol.photos.poses import check_colmap, find_poses

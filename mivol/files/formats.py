@@ -119,6 +119,9 @@ FORMATS: dict[str, VolumeFormat] = {
 RAW_BYTES = "raw bytes"
 
 #: name of a kind of file without a reader here -> (test of the first ``HEAD`` bytes, way out).
+ARCHIVE, FILM = "a zip archive", "a video"
+"""Files that phones export, which other verbs take or which have to be unpacked."""
+
 UNREAD: dict[str, tuple[Callable[[bytes], bool], str]] = {
     "an MRC file": (mrc.is_mrc, "name it .mrc"),
     "a DICOM file": (dicom.is_dicom, "describe or convert it by mivol explain and mivol convert"),
@@ -126,6 +129,11 @@ UNREAD: dict[str, tuple[Callable[[bytes], bool], str]] = {
     "a MATLAB file": (_starts_with(b"MATLAB"), "name it .mat"),
     "an HDF5 file": (_starts_with(hdf5.MAGIC), "name a volume .h5; explain and optimize find the data of a scan"),
     "a TIFF file": (tiff.is_tiff, "name it .tif, or the folder of a scan for explain and optimize"),
+    ARCHIVE: (_starts_with(b"PK\x03\x04"), "unpack it, and name its folder"),
+    FILM: (
+        lambda head: (head[4:8] == b"ftyp" and head[8:11] != b"hei") or head.startswith((b"\x1aE\xdf\xa3", b"RIFF")),
+        "mivol poses FILE finds the cameras of its frames",
+    ),
     RAW_BYTES: (
         lambda head: b"\0" in head,
         "say size and type by --shape and --dtype (shape= and dtype= in Python), or in a header .nhdr or .mhd beside them",
@@ -504,7 +512,8 @@ def refuse_unread(path: Path) -> MivolError:
     suffix = f"the suffix {path.suffix!r}"
     if found is None:
         return refusal(path, suffix, f"one of {', '.join(FORMATS)}", "convert the file or correct its name")
-    return refusal(path, f"{found} with {suffix}", f"a volume of {', '.join(FORMATS)}", UNREAD[found][1])
+    expected = "a folder of photographs or a model" if found in (ARCHIVE, FILM) else f"a volume of {', '.join(FORMATS)}"
+    return refusal(path, f"{found} with {suffix}", expected, UNREAD[found][1])
 
 
 def _find_format(path: Path, shape: Sequence[int] | None = None, dtype: np.dtype | str | None = None) -> VolumeFormat:

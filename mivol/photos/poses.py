@@ -186,6 +186,9 @@ def _begin_work(work: Path, images: Path, names: list[str]) -> None:
 
 def _check_folder(folder: Path) -> tuple[Path, list[str]]:
     """The folder of the images, and the names of the photographs in it."""
+    if folder.is_file():
+        found = f"a file {folder.suffix or 'without a suffix'}"
+        raise refusal(folder, found, "a folder of photographs, or a video", "unpack an archive, and name its folder")
     if not folder.is_dir():
         raise refusal(folder, "no folder", "a folder of photographs", "check the path")
     check_colmap()

@@ -183,7 +183,8 @@ def _read(path: Path) -> tuple[str, Listing]:
         if names := list_photographs(path)[1]:
             found = f"{len(names)} photograph{'s' * (len(names) != 1)} without cameras"
             raise refusal(path, found, f"cameras of {known}", f"mivol poses {path} finds them")
-        raise refusal(path, "no cameras", f"one of {known}", "name the folder of the file of cameras")
+        found = "no photographs and no cameras" if path.is_dir() else "no cameras"
+        raise refusal(path, found, f"photographs with cameras of {known}", "name the folder that holds them")
     return name, DATA_SET_FORMATS[name].read(path)
 
 

@@ -2,8 +2,11 @@
 
 Conventions. The video is cut into pieces of equal time, and the sharpest of ``CANDIDATES`` frames of each piece is kept, if the
 image has moved since the last kept frame. Sharpness is the variance of the Laplacian (Pech-Pacheco et al. 2000). Motion is the
-shift of the whole image by phase correlation (Kuglin and Hines 1975), as a share of its width; a turn of the camera shifts the
-image as a step does.
+shift of the whole image by phase correlation (Kuglin and Hines 1975), as a share of its width.
+
+A turn of the camera on the spot shifts the image as a step does, but shows no depth. It maps image points by a homography,
+whatever the scene; a step does so for a plane only. Parallax is what the homography that fits best leaves of the shifts of
+small blocks. A frame without parallax is kept only after a large shift, before the overlap with the last frame is lost.
 """
 
 from __future__ import annotations
@@ -35,8 +38,23 @@ LONGEST = 1800.0
 MOTION = 0.01
 """Least shift between two kept frames, over the width of the image."""
 
-SMALL = 128
+PARALLAX = 0.002
+"""Least parallax between two kept frames that overlap well, over the width of the image."""
+
+FAR = 0.08
+"""Shift between two kept frames from which parallax is not asked for, over the width of the image."""
+
+SMALL = 256
 """Width of the images whose shift is found [pixel]."""
+
+BLOCK, STEP = 64, 20
+"""Edge of the blocks whose shifts show parallax, and the distance between them [pixel]."""
+
+CLEAR = 0.15
+"""Least height of the peak of a block's phase correlation, which is 1 for a pure shift."""
+
+ENOUGH = 12
+"""Blocks with a clear shift for a homography, which has 8 numbers."""
 
 
 def extract_frames(video: Path, rate: float | None = None, say: Callable[[str], None] = lambda line: None) -> Path:
@@ -73,7 +91,8 @@ def extract_frames(video: Path, rate: float | None = None, say: Callable[[str], 
             found = f"{kept} frame{'s' * (kept != 1)} between which the camera moved, of {pieces} pieces"
             raise refusal(video, found, "at least 3", "film while you walk around the subject")
         images.rename(folder / "images")
-    say(f"{folder / 'images'}: {kept} sharp frames of {duration:.0f} s; {pieces - kept} without motion are left out")
+    rest = f"{pieces - kept} without motion or parallax are left out"
+    say(f"{folder / 'images'}: {kept} sharp frames of {duration:.0f} s; {rest}")
     return folder
 
 
@@ -118,7 +137,7 @@ def _keep_frames(video: Path, rate: float, images: Path) -> tuple[int, int]:
             return
         pieces += 1
         small = _shrink(best[1])
-        if last is None or motion(last, small) >= MOTION:
+        if last is None or shows_more(last, small):
             kept, last = kept + 1, small
             PIL.Image.fromarray(best[1]).save(images / f"frame_{kept:05d}.jpg", quality=95, subsampling=0)
         best = None
@@ -142,15 +161,70 @@ def sharpness(frame: np.ndarray) -> float:
     return float((half[:-2, 1:-1] + half[2:, 1:-1] + half[1:-1, :-2] + half[1:-1, 2:] - 4 * inner).var())
 
 
+def shows_more(last: np.ndarray, frame: np.ndarray) -> bool:
+    """Whether a small grey image (H, W) shows depth, or other parts, beside the last kept one."""
+    shift = motion(last, frame)
+    return shift >= FAR or (shift >= MOTION and parallax(last, frame) >= PARALLAX)
+
+
 def motion(one: np.ndarray, other: np.ndarray) -> float:
     """Shift between two small grey images of equal size (H, W), over their width."""
+    return float(np.hypot(*find_shift(one, other)[0])) / one.shape[1]
+
+
+def find_shift(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, float]:
+    """Shift (row, column) of the contents from an image to another of equal size [pixel], and the height of its peak, 0..1.
+
+    The peak of the phase correlation is refined by parabolas along both axes.
+    """
     window = np.outer(np.hanning(one.shape[0]), np.hanning(one.shape[1]))
     a, b = (np.fft.rfft2((image - image.mean()) * window) for image in (one, other))
-    cross = a * np.conj(b)
+    cross = b * np.conj(a)
     peak = np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-12), one.shape)
-    row, column = np.unravel_index(int(np.argmax(peak)), peak.shape)
-    shifts = [index if index <= n // 2 else index - n for index, n in zip((row, column), peak.shape, strict=True)]
-    return float(np.hypot(*shifts)) / one.shape[1]
+    place, shift = np.unravel_index(int(np.argmax(peak)), peak.shape), np.zeros(2)
+    for axis, n in enumerate(peak.shape):
+        low, middle, high = (np.take(peak, place[axis] + k, axis, mode="wrap")[place[1 - axis]] for k in (-1, 0, 1))
+        index = place[axis] if place[axis] <= n // 2 else place[axis] - n
+        shift[axis] = index + 0.5 * (high - low) / max(2 * middle - low - high, 1e-12)
+    return shift, float(peak[place])
+
+
+def parallax(one: np.ndarray, other: np.ndarray) -> float:
+    """What no homography explains of the shifts of blocks: root mean square of the rest, over the width of the images.
+
+    Args:
+        one, other: small grey images of equal size (H, W).
+
+    Returns:
+        Infinite if fewer than ``ENOUGH`` blocks have a clear shift: then nothing says that there is no parallax.
+    """
+    first = np.round(find_shift(one, other)[0]).astype(int)
+    pairs = []
+    for row in range(0, one.shape[0] - BLOCK + 1, STEP):
+        for column in range(0, one.shape[1] - BLOCK + 1, STEP):
+            place = np.array([row, column])
+            # Twice: blocks that overlap as far as they can have a clear peak, and a wrong peak is not found again.
+            there, shift, height = place + first, np.zeros(2), 0.0
+            for _ in range(2):
+                there = there + np.round(shift).astype(int)
+                is_inside = (there >= 0).all() and (there + BLOCK <= one.shape).all()
+                shift, height = find_shift(_cut(one, place), _cut(other, there)) if is_inside else (shift, 0.0)
+            if height >= CLEAR:
+                middle = place + BLOCK / 2
+                pairs.append([*middle, *(middle + there - place + shift)])
+    if len(pairs) < ENOUGH:
+        return np.inf
+    y, x, v, u = (np.array(pairs) / one.shape[1] - 0.5).T
+    zero, unit = np.zeros_like(x), np.ones_like(x)
+    rows = [[x, y, unit, zero, zero, zero, -u * x, -u * y], [zero, zero, zero, x, y, unit, -v * x, -v * y]]
+    matrix = np.concatenate([np.stack(row, axis=1) for row in rows])
+    rest = matrix @ np.linalg.lstsq(matrix, np.concatenate([u, v]), rcond=None)[0] - np.concatenate([u, v])
+    return float(np.sqrt(2 * np.mean(rest**2)))
+
+
+def _cut(image: np.ndarray, corner: np.ndarray) -> np.ndarray:
+    """The block at a corner."""
+    return image[corner[0] : corner[0] + BLOCK, corner[1] : corner[1] + BLOCK]
 
 
 def _shrink(frame: np.ndarray) -> np.ndarray:

@@ -111,7 +111,24 @@ def test_explain_draws_nothing_that_was_not_asked_for(tmp_path: Path, monkeypatc
 
 def test_explain_refuses_a_folder_without_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["explain", str(tmp_path)]) == 1
-    assert "found no cameras, expected one of Blender (NeRF), transforms.json, COLMAP" in capsys.readouterr().err
+    assert "found no photographs and no cameras, expected photographs with cameras of Blender (NeRF)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "way_out"),
+    [
+        ("scan.r3d", b"PK\x03\x04", "unpack it, and name its folder"),
+        ("a.mp4", b"\0\0\0\x20ftypisom", "mivol poses FILE finds"),
+        ("a.webm", b"\x1aE\xdf\xa3", "mivol poses FILE finds"),
+    ],
+)
+def test_exports_of_phones_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, head: bytes, way_out: str
+) -> None:
+    (tmp_path / name).write_bytes(head + bytes(64))
+    for verb in ("optimize", "explain"):
+        assert main([verb, str(tmp_path / name)]) == 1
+        assert way_out in capsys.readouterr().err
 
 
 def test_drawn_cameras_lie_in_the_world(tmp_path: Path) -> None:
