@@ -311,15 +311,21 @@ def _estimate_baseline(estimators: Estimators, ray: mi.Ray3f) -> Baseline | None
     # Numbers of pixels outside of every film.
     lane, one = dr.arange(mi.UInt32, count), mi.UInt32(1)
     sampler = SpreadSampler.of_pixels(mi.Vector2i(lane, -1), mi.UInt32(BASELINE_SEED), dr.zeros(mi.UInt32, count), one)
-    L = dr.detach(walk_path(estimators, sampler.clone(), chosen, Primal(dr.zeros(mi.Spectrum, count)))[0].L)
     sums = BaselineSums(media)
 
-    def collect(factor: Factor, light: mi.Spectrum) -> None:
-        if isinstance(factor, SegmentTransmittance):
-            factor.shared.collect(sums, light)
+    def turn(number: mi.UInt32, L: mi.Spectrum) -> tuple[mi.UInt32, mi.Spectrum]:
+        """Walk the paths: the first time for their light, the second time with it for the light behind collisions. As a loop
+        both walks are compiled once."""
+        is_known = number > 0
 
-    # Evaluated before the light of paths is added: the second walk adds it with the collisions, in one kernel.
-    dr.eval(L)
+        def collect(factor: Factor, light: mi.Spectrum) -> None:
+            if isinstance(factor, SegmentTransmittance):
+                factor.shared.collect(sums, light, is_known)
+
+        rest = walk_path(estimators, sampler.clone(), chosen, Rest(L, collect))[0].L
+        return number + 1, dr.select(is_known, L, -dr.detach(rest))
+
+    start = dr.zeros(mi.UInt32, count), dr.zeros(mi.Spectrum, count)
+    _, L = dr.while_loop(state=start, cond=lambda number, L: number < 2, body=turn, label="baseline")
     sums.add_path(L)
-    walk_path(estimators, sampler, chosen, Rest(L, collect))
     return sums.finish()

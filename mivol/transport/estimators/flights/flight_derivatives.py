@@ -201,15 +201,16 @@ class FlightSegment:
 
         vjp_rows(self.media, self.passed, weight, self.active & dr.any((dlog != 0) | (scattered != 0)))
 
-    def collect(self, sums: BaselineSums, L: mi.Spectrum) -> None:
+    def collect(self, sums: BaselineSums, L: mi.Spectrum, active: mi.Bool) -> None:
         """Add the collision at the end of the flight to the sums of a baseline.
 
         Args:
             sums: the sums.
             L: light behind the flight, at the camera [radiance].
+            active: lanes whose collision counts.
         """
         hit, scattered = self.collision, self._scattered
-        on = hit.on & self.segment.may_scatter & dr.any(scattered != 0)
+        on = active & hit.on & self.segment.may_scatter & dr.any(scattered != 0)
         weight = scattered * collision_weights(self.media, self.segment.ray, hit)
         light = L / dr.select(scattered != 0, scattered, 1)
         sums.add(self.segment.ray, hit.t, hit.body, dr.square(weight), light, on)
