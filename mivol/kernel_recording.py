@@ -138,7 +138,8 @@ class RecordedFunctions:
     """Functions of structures of arrays, whose kernels are recorded in the first call and replayed in later calls.
 
     A call is recorded anew for another function, for other values in the structures that are no arrays, and for other sizes of
-    arrays, since a recording holds sizes as numbers. A function that Dr.Jit cannot record is run.
+    arrays, since a recording holds sizes as numbers. A function that Dr.Jit cannot record is run, and :meth:`describe_failure`
+    says so.
 
     Args:
         most: largest number of recordings; the least recently used is dropped.
@@ -146,6 +147,7 @@ class RecordedFunctions:
 
     def __init__(self, most: int = 8) -> None:
         self._recordings = Recordings(most, keeps_literals=False)
+        self._failure = ""
 
     @property
     def count(self) -> int:
@@ -165,8 +167,17 @@ class RecordedFunctions:
         make = partial(_FunctionTask, function, arguments)
         try:
             return self._recordings.call(_FunctionTask, (function, key), make, arrays)
-        except CannotRecordError:
+        except CannotRecordError as error:
+            self._failure = f"{function.__name__}: {error}"
             return function(*arguments)
+
+    def describe_failure(self) -> str:
+        """A sentence about the last function that could not be recorded, or ""."""
+        if not self._failure:
+            return ""
+        return (
+            f"Dr.Jit could not record a part of the step, which is traced anew in each step and takes longer ({self._failure})"
+        )
 
 
 class _FunctionTask(RecordedTask):

@@ -57,6 +57,7 @@ class FieldFit(PhotoFit):
     settings: FieldExperiment
     problem: RadianceProblem
     fits_colours = True
+    steps = "recorded in the first step, then replayed; recorded anew once in 64 steps, for a new list of occupied cells"
 
     def make_plan(self, settings: FieldExperiment) -> RadiancePlan:
         return make_plan(settings)

@@ -51,6 +51,7 @@ class GaussianFit(PhotoFit):
     settings: GaussianExperiment
     problem: GaussianProblem
     stages = Stages("photographs", "fit", "images and Gaussians")
+    steps = "recorded in the first step, then replayed; lists of tiles are sorted on the host in each step"
 
     @property
     def fits_colours(self) -> bool:

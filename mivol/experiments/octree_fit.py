@@ -60,6 +60,7 @@ class OctreeFit(FieldFit):
     settings: OctreeExperiment
     problem: OctreeProblem
     network: SampledField | None = None
+    steps = "of the grid recorded in the first step, then replayed; of the leaves traced in each step"
 
     def make_plan(self, settings: OctreeExperiment) -> OctreePlan:
         return make_octree_plan(settings)

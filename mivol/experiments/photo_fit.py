@@ -10,7 +10,7 @@ from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -208,11 +208,13 @@ class PhotoFit(FitKind):
         film: cameras of the film.
         levels: nested boxes of the model.
         fits_colours: whether judged views also have a PSNR with their colours fitted to the photographs'.
+        steps: how the kernels of steps are made.
     """
 
     stages = Stages("photographs", "fit", "images and volumes")
     levels: int = 1
     fits_colours: bool
+    steps: ClassVar[str]
     plan: Any
     settings: PhotoExperiment
 
@@ -244,6 +246,7 @@ class PhotoFit(FitKind):
         self.record.notes = [*describe_photos(self.photos, self.judged), *self.film.notes]
         for line in self.record.plan:
             say(f"  {line.choice}: {line.reason}")
+        say(f"  steps: {self.steps}")
 
     @property
     def home_view(self) -> HomeView:

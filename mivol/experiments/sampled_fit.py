@@ -34,6 +34,7 @@ class SampledFit(FieldFit):
 
     settings: HashExperiment | NerfExperiment
     problem: SampledProblem
+    steps = "traced in each step, because the number of samples changes"
 
     def make_plan(self, settings: HashExperiment | NerfExperiment) -> SampledPlan:
         return make_sampled_plan(settings)

@@ -162,6 +162,9 @@ class RMSpropRun(OptimizerRun):
         self.reals, self.squares = reals, squares
         return loss
 
+    def warning(self) -> str:
+        return self._recorded.describe_failure()
+
     def _store(self, means: mi.TensorXf) -> mi.TensorXf | mi.TensorXf16:
         return store_means(means, self.settings.half)
 

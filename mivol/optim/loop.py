@@ -73,7 +73,7 @@ class Fit:
             reads the others first, and waits for them.
         evaluations: records (iteration, seconds, ...) of the evaluations.
         log: messages of events, and a message about the noise of renders in the loss.
-        has_warned: whether the log holds the message about noise.
+        has_warned: whether the log holds the message of :meth:`Problem.warning` or of :meth:`OptimizerRun.warning`.
         seconds: time of the iterations [s], without interruptions; up to the last loss that was read.
     """
 
@@ -227,8 +227,8 @@ class Fit:
         self.log += [f"iteration {self.next_iteration}: {message}"] if message else []
 
     def _warn(self, step: _Unread) -> None:
-        """Log once that the noise of renders makes up a large share of the loss."""
-        message = "" if self.has_warned else step.warning()
+        """Log once that the noise of renders makes up a large share of the loss, or that steps are slower than they could be."""
+        message = "" if self.has_warned else step.warning() or self.run.warning()
         if message:
             self.log.append(f"iteration {step.iteration}: {message}")
             self.has_warned = True

@@ -39,6 +39,10 @@ class OptimizerRun:
         """
         raise NotImplementedError
 
+    def warning(self) -> str:
+        """A sentence about a fault that slows the steps down, or ""."""
+        return ""
+
     def pack(self) -> dict[str, np.ndarray]:
         """All inputs of the next step, as arrays."""
         return {f"reals/{name}": np.array(value) for name, value in self.reals.items()}

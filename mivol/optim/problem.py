@@ -45,7 +45,8 @@ class Problem(Protocol):
 
     @property
     def warning(self) -> Callable[[], str]:
-        """Function that returns a sentence about the noise of the latest loss, or ""; it may wait for the loss."""
+        """Function that returns a sentence about the noise of the latest loss, or about slow steps, or ""; it may wait for the
+        loss."""
         return str
 
     def pack(self, reals: Reals) -> dict[str, np.ndarray]:

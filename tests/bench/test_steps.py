@@ -56,6 +56,22 @@ def test_a_study_counts_and_compares(tmp_path: Path) -> None:
     assert not bar["met"]
 
 
+def test_a_loop_fits_its_parameter() -> None:
+    """Adam's first step moves each number with a derivative by its rate, and values stay at 0 or above."""
+    loop = study._FitLoop(study.chosen_scenes(["jade_null_sun"])["jade_null_sun"], "mivol", 4, 1)
+    before = np.array(loop.start)
+    loop.fit()
+    after = np.array(loop.params[loop.key])
+    assert np.allclose(np.abs(after - before).max(), 1e-3, rtol=1e-3) and after.min() >= 0
+
+
+def test_loops_have_a_row_for_each_film(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study, "FILMS", ((2, 1), (4, 2)))
+    answer = study.measure_loops(study.StepsSize(loop_scenes=("tutorial",), films=2, loop_steps=1))
+    assert list(answer["rows"]) == ["tutorial, 2^2 x 1", "tutorial, 4^2 x 2"]
+    assert answer["least_ratio"] == min(row["ratio"] for row in answer["rows"].values()) > 0
+
+
 def test_a_scene_that_is_misspelt_is_named() -> None:
     with pytest.raises(MivolError, match='there is no scene "jade_null_sum": .*jade_null_sun'):
         study.measure_steps(False, study.StepsSize(scenes=("jade_null_sum",)))

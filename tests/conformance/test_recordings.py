@@ -628,3 +628,19 @@ def test_out_of_memory_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(render_tasks.ImageTask, "__call__", fail)
     with refused("a render of 6 x 6 pixels ran out of memory on this machine: render crops"):
         mi.render(scene, integrator=integrator, spp=1)
+
+
+def scale_by_first(x: mi.Float) -> mi.Float:
+    return x * float(x[0])
+
+
+def double(x: mi.Float) -> mi.Float:
+    return 2 * x
+
+
+def test_a_function_that_cannot_be_recorded_runs_and_says_so(variant_rgb: str) -> None:
+    functions, x = RecordedFunctions(), dr.opaque(mi.Float, 3.0, 2)
+    assert (np.array(functions.call(double, x)) == 6).all() and functions.describe_failure() == ""
+    for _ in range(3):
+        assert (np.array(functions.call(scale_by_first, x)) == 9).all()
+    assert "traced anew in each step and takes longer (scale_by_first: " in functions.describe_failure()

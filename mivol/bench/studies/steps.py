@@ -2,12 +2,16 @@
 
     mivol bench steps                                        # half a minute on 2 idle cores
     mivol bench steps --only fits                            # ten seconds: steps of mivol's own fits
+    mivol bench steps --only loops                           # two minutes: loops with an optimizer, from 16^2 x 1 to 128^2 x 16
     mivol bench steps --quick                                # ten seconds, two scenes, few steps
     mivol bench steps --scenes tutorial god_rays --sides 16 64 --spp 1 16
 
 A step sets a parameter, calls ``params.update()``, and renders an image; with a gradient it also calls ``dr.backward`` on a
 loss of the image. The loop with ``mivol`` and the loop with ``prbvolpath`` differ in the name of the integrator only. They take
 turns. On the smallest film kernels take no time, so a step shows the work of the host: tracing, or the replay of a recording.
+
+loops: the same with a whole step of a fit, as in the tutorials of Mitsuba: ``mi.render``, ``dr.backward`` on the mean squared
+difference from a constant image, ``mi.ad.Adam``, values clipped at 0, ``params.update()``.
 
 The scene ``tutorial`` is the smoke of the Mitsuba tutorial under a sky at depth 6; the other scenes are scenes of the study
 ``everyday``.
@@ -79,6 +83,9 @@ class StepsSize(Size):
     sides: tuple[int, ...] = amount((4, 16, 64), (4,), "edges of the image [pixels]")
     spp: tuple[int, ...] = amount((1,), doc="samples per pixel of a step")
     steps: int = amount(15, 3, "steps of each integrator")
+    loop_scenes: tuple[str, ...] = amount(("tutorial", "smoke_on_floor", "jade_null_sun"), ("tutorial",), "scenes of loops")
+    films: int = amount(4, 1, "films of loops: 16^2 x 1, 32^2 x 4, 64^2 x 16, 128^2 x 16")
+    loop_steps: int = amount(7, 2, "steps of each loop")
 
 
 class _Loop:
@@ -106,13 +113,52 @@ class _Loop:
         dr.sync_thread()
 
 
+class _FitLoop(_Loop):
+    """A user's fit of a parameter by ``mi.ad.Adam``."""
+
+    def __init__(self, scene: EverydayScene, name: str, side: int, spp: int) -> None:
+        super().__init__(scene, name, side, spp)
+        self.adam = mi.ad.Adam(lr=1e-3, params={self.key: self.start})
+        self.params.update(self.adam)
+
+    def fit(self) -> None:
+        """Take a step."""
+        self.count += 1
+        image = mi.render(self.scene, self.params, integrator=self.integrator, spp=self.spp, seed=self.count)
+        dr.backward(dr.mean(dr.square(image - 0.5), axis=None))
+        self.adam.step()
+        self.adam[self.key] = dr.maximum(self.adam[self.key], 0)
+        self.params.update(self.adam)
+        dr.eval(self.adam[self.key])
+        dr.sync_thread()
+
+
+FILMS = (16, 1), (32, 4), (64, 16), (128, 16)
+"""Edge [pixels] and samples per pixel of loops."""
+
+
+def measure_loops(size: StepsSize) -> dict:
+    """Time whole steps of fits by both integrators."""
+    rows = {}
+    for name, scene in choose_scenes(size.loop_scenes).items():
+        for side, spp in FILMS[: size.films]:
+            loops = {who: _FitLoop(scene, who, side, spp) for who in (PEER, "mivol")}
+            row = race_steps({who: loop.fit for who, loop in loops.items()}, size.loop_steps)
+            rows[f"{name}, {side}^2 x {spp}"] = row
+            say_row(f"{name}, {side}^2 x {spp}", ratio=row["ratio"], milliseconds=row["milliseconds"]["mivol"])
+    return {"rows": rows, "least_ratio": min(row["ratio"] for row in rows.values())}
+
+
+def choose_scenes(names: tuple[str, ...]) -> dict[str, EverydayScene]:
+    """The scenes of these names; ``tutorial`` comes last."""
+    scenes = chosen_scenes([name for name in names if name != "tutorial"])
+    return scenes | {"tutorial": TUTORIAL} if "tutorial" in names else scenes
+
+
 def measure_steps(differentiates: bool, size: StepsSize) -> dict:
     """Time steps of both integrators in each scene and for each film."""
     rows = {}
-    scenes = chosen_scenes([name for name in size.scenes if name != "tutorial"])
-    if "tutorial" in size.scenes:
-        scenes["tutorial"] = TUTORIAL
-    for name, scene in scenes.items():
+    for name, scene in choose_scenes(size.scenes).items():
         for side, spp in itertools.product(size.sides, size.spp):
             row = _contend({who: _Loop(scene, who, side, spp) for who in (PEER, "mivol")}, size, differentiates)
             rows[f"{name}, {side}^2 x {spp}"] = row
@@ -240,6 +286,7 @@ def draw(answers: dict, path: Path) -> None:
 QUESTIONS: dict[str, Question] = {
     "images": ask("How long does a step with an image take?", measure_steps, False),
     "gradients": ask("How long does a step with an image and its gradient take?", measure_steps, True),
+    "loops": ask("How long does a whole step of a user's fit take?", measure_loops),
     "fits": ask("How long does a step of a fit take?", measure_fits),
 }
 

@@ -139,6 +139,10 @@ class RadianceProblem(SparseProblem, DividedProblem):
         self._recorded = RecordedFunctions()
         self._update_neighbours()
 
+    @property
+    def warning(self) -> Callable[[], str]:
+        return self._recorded.describe_failure
+
     # -- Values -------------------------------------------------------------------------------------------------------
 
     def initial_reals(self) -> Reals:
