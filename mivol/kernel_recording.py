@@ -175,9 +175,7 @@ class RecordedFunctions:
         """A sentence about the last function that could not be recorded, or ""."""
         if not self._failure:
             return ""
-        return (
-            f"Dr.Jit could not record a part of the step, which is traced anew in each step and takes longer ({self._failure})"
-        )
+        return f"Dr.Jit could not record a part of the step: it is traced anew in each step and takes longer ({self._failure})"
 
 
 class _FunctionTask(RecordedTask):

@@ -227,7 +227,7 @@ class Fit:
         self.log += [f"iteration {self.next_iteration}: {message}"] if message else []
 
     def _warn(self, step: _Unread) -> None:
-        """Log once that the noise of renders makes up a large share of the loss, or that steps are slower than they could be."""
+        """Log once that the noise of renders makes up a large share of the loss, or that steps are slow."""
         message = "" if self.has_warned else step.warning() or self.run.warning()
         if message:
             self.log.append(f"iteration {step.iteration}: {message}")

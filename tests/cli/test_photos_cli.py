@@ -66,7 +66,14 @@ def test_explain_says_what_a_fit_would_do_and_draws_its_boxes(tmp_path: Path, ca
     few = ["--as", "grid", "--preset", "capture", "--set", "field.longest=16"]
     assert main(["explain", *few, str(folder), "-o", str(picture)]) == 0
     said = capsys.readouterr().out
-    for fact in ("judged by 2 photographs", "5 nested boxes", "cameras stand in the innermost", "16 nodes", str(picture)):
+    for fact in (
+        "judged by 2 photographs",
+        "steps: recorded in the first step",
+        "5 nested boxes",
+        "cameras stand in the innermost",
+        "16 nodes",
+        str(picture),
+    ):
         assert fact in said
     with Image.open(picture) as image:
         assert image.size == (plain[0] // 2 * 3, plain[1])

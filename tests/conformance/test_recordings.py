@@ -643,4 +643,4 @@ def test_a_function_that_cannot_be_recorded_runs_and_says_so(variant_rgb: str) -
     assert (np.array(functions.call(double, x)) == 6).all() and functions.describe_failure() == ""
     for _ in range(3):
         assert (np.array(functions.call(scale_by_first, x)) == 9).all()
-    assert "traced anew in each step and takes longer (scale_by_first: " in functions.describe_failure()
+    assert "it is traced anew in each step and takes longer (scale_by_first: " in functions.describe_failure()
