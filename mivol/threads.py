@@ -4,8 +4,9 @@ Reason. Dr.Jit 1.5 keeps one copy of a small scatter target for each pool thread
 Python threads as the same pool thread. Two Python threads then add to one copy without atomics. Up to a third of a gradient was
 missing in a test, without an error. A forked child has no pool threads at all. Therefore every function that renders or
 differentiates calls :func:`check_one_thread` first, and child processes are started by :func:`run_child` and
-:func:`follow_program`. :func:`map_arrays` starts threads that compute with NumPy alone. No other module of mivol starts threads
-or processes; ``mivol.cluster`` lets Dask start workers, each a fresh process with one thread for Dr.Jit.
+:func:`follow_program`. :func:`map_arrays` and :class:`CallsAhead` start threads that compute with NumPy and write files. No
+other module of mivol starts threads or processes; ``mivol.cluster`` lets Dask start workers, each a fresh process with one
+thread for Dr.Jit.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from .errors import MivolError
 
@@ -99,6 +100,34 @@ def map_arrays(work: Callable[[Item], Result], items: Sequence[Item], count: int
         return [work(item) for item in items]
     with ThreadPoolExecutor(min(count, len(items))) as pool:
         return list(pool.map(work, items))
+
+
+MAX_AHEAD = 2
+"""Most calls that wait in :class:`CallsAhead`: each may hold an image."""
+
+
+class CallsAhead:
+    """Calls in a thread of their own, one after another, while the caller goes on: an image is written while the next is
+    rendered."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(1)
+        self._waiting: list[Future] = []
+
+    def submit(self, work: Callable[..., Result], *args: Any) -> Future[Result]:
+        """Begin ``work(*args)`` after the earlier calls; waits for the oldest one if ``MAX_AHEAD`` of them are waiting.
+
+        Args:
+            work: computes with NumPy alone; it must not touch Dr.Jit.
+            args: its arguments, which nobody changes meanwhile.
+
+        Raises:
+            Exception: of an earlier call.
+        """
+        while len(self._waiting) >= MAX_AHEAD:
+            self._waiting.pop(0).result()
+        self._waiting.append(self._pool.submit(work, *args))
+        return self._waiting[-1]
 
 
 def run_program(*command: str, timeout: float) -> str:

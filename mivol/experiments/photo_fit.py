@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -33,6 +34,7 @@ from mivol.photos.region import FEWEST_VIEWS, find_free_distances, viewing_dista
 from mivol.report.cameras import draw_photo_cameras, plot_cameras, survey_all_cameras
 from mivol.report.record import CODES, Image, PlanLine, Table
 from mivol.scene.explain import Explanation
+from mivol.threads import CallsAhead
 from mivol.validate.metrics import METRICS, ImageScore, average_scores, fit_colours, score_image
 
 MANY = 32
@@ -61,7 +63,7 @@ def format_metric(metric: str, value: float) -> str:
 
 @dataclass
 class JudgedViews:
-    """Images of judged views, written view by view.
+    """Images of judged views, written view by view, each while the next is rendered.
 
     Attributes:
         folder: run folder.
@@ -74,7 +76,8 @@ class JudgedViews:
     space: str
     count: int
     shown: int
-    _images: dict[int, list[Image]] = field(default_factory=dict, init=False)
+    _images: dict[int, Future[list[Image]]] = field(default_factory=dict, init=False)
+    _calls: CallsAhead = field(default_factory=CallsAhead, init=False)
     _psnr: dict[int, float] = field(default_factory=dict, init=False)
     _worst: tuple[Photo, int, NDArray, str] | None = field(default=None, init=False)
 
@@ -90,7 +93,8 @@ class JudgedViews:
         number = len(self._psnr)
         if self.shown:
             edge = None if number in select_shown_views(self.count, self.shown) else EDGES[self.count > MANY]
-            self._images[number] = write_view(self.folder, photo, number, image, self.space, caption, edge)
+            given = self.folder, photo, number, image, self.space, caption, edge
+            self._images[number] = self._calls.submit(write_view, *given)
             if psnr < min(self._psnr.values(), default=np.inf):
                 self._worst = photo, number, image, caption
         self._psnr[number] = psnr
@@ -102,10 +106,11 @@ class JudgedViews:
             return []
         photo, worst, image, caption = self._worst
         worst_caption = f"the worst of {self.count}: {caption}"
-        self._images[worst] = write_view(self.folder, photo, worst, image, self.space, worst_caption)
+        images = {number: written.result() for number, written in self._images.items()}
+        images[worst] = write_view(self.folder, photo, worst, image, self.space, worst_caption)
         whole = [n for n in sorted(select_shown_views(self.count, self.shown)) if n != worst]
-        small = sorted(self._images.keys() - {worst, *whole}, key=self._psnr.__getitem__)
-        return [one for number in (worst, *whole, *small) for one in self._images[number]]
+        small = sorted(images.keys() - {worst, *whole}, key=self._psnr.__getitem__)
+        return [one for number in (worst, *whole, *small) for one in images[number]]
 
 
 def write_view(

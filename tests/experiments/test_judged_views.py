@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from mivol.experiments.photo_fit import (
     write_view,
 )
 from mivol.photos import Camera, Photo, intrinsics
+from mivol.threads import CallsAhead
 from mivol.validate.metrics import ImageScore
 
 
@@ -91,3 +93,31 @@ def test_what_is_said_of_views() -> None:
     assert describe_views([photo("a")] * 3) == "3 views at 4 x 2 pixels"
     assert describe_views([photo("a")]) == "1 view at 4 x 2 pixels"
     assert describe_views([photo("a"), photo("b", 6)]) == "2 views at their own sizes"
+
+
+def test_calls_go_ahead_of_their_results() -> None:
+    """The caller goes on while a call waits, up to two calls ahead; calls keep their order, and an error reaches the caller."""
+    calls, gate, order = CallsAhead(), threading.Event(), []
+
+    def work(number: int) -> int:
+        assert gate.wait(60)
+        order.append(number)
+        return 1 // (3 - number)
+
+    first, second = calls.submit(work, 0), calls.submit(work, 1)
+    assert not first.done() and not second.done()
+    gate.set()
+    assert [calls.submit(work, number).result() for number in (2,)] == [1]
+    calls.submit(work, 3)
+    calls.submit(work, 4)
+    with pytest.raises(ZeroDivisionError):
+        calls.submit(work, 5)
+    assert (first.result(), second.result()) == (0, 0) and order[:4] == [0, 1, 2, 3]
+
+
+def test_at_most_two_calls_wait() -> None:
+    calls, gate = CallsAhead(), threading.Event()
+    waiting = [calls.submit(gate.wait, 60) for _ in range(2)]
+    threading.Timer(0.05, gate.set).start()
+    calls.submit(gate.wait, 60)
+    assert waiting[0].done()
