@@ -7,8 +7,7 @@ Conventions. ``metrics.jsonl`` has the loss of a step and, at some steps, the PS
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Sequence
-from concurrent.futures import Future
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -76,7 +75,7 @@ class JudgedViews:
     space: str
     count: int
     shown: int
-    _images: dict[int, Future[list[Image]]] = field(default_factory=dict, init=False)
+    _images: dict[int, Callable[[], list[Image]]] = field(default_factory=dict, init=False)
     _calls: CallsAhead = field(default_factory=CallsAhead, init=False)
     _psnr: dict[int, float] = field(default_factory=dict, init=False)
     _worst: tuple[Photo, int, NDArray, str] | None = field(default=None, init=False)
@@ -94,7 +93,7 @@ class JudgedViews:
         if self.shown:
             edge = None if number in select_shown_views(self.count, self.shown) else EDGES[self.count > MANY]
             given = self.folder, photo, number, image, self.space, caption, edge
-            self._images[number] = self._calls.submit(write_view, *given)
+            self._images[number] = self._calls.submit(write_view, *given).result
             if psnr < min(self._psnr.values(), default=np.inf):
                 self._worst = photo, number, image, caption
         self._psnr[number] = psnr
@@ -106,7 +105,7 @@ class JudgedViews:
             return []
         photo, worst, image, caption = self._worst
         worst_caption = f"the worst of {self.count}: {caption}"
-        images = {number: written.result() for number, written in self._images.items()}
+        images = {number: result() for number, result in self._images.items()}
         images[worst] = write_view(self.folder, photo, worst, image, self.space, worst_caption)
         whole = [n for n in sorted(select_shown_views(self.count, self.shown)) if n != worst]
         small = sorted(images.keys() - {worst, *whole}, key=self._psnr.__getitem__)
