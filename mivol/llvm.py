@@ -151,7 +151,7 @@ def rank_libraries(libraries: Sequence[Library]) -> list[Library]:
     return sorted(tested, key=lambda lib: -lib.major) + sorted(newer, key=lambda lib: lib.major)
 
 
-def _loads(path: Path) -> bool:
+def _can_load(path: Path) -> bool:
     try:
         # Loaded in this process, where Dr.Jit is about to load the same file. Local symbols cannot shadow other libraries.
         ctypes.CDLL(str(path), mode=ctypes.RTLD_LOCAL)
@@ -176,7 +176,7 @@ def choose_library() -> None:
         _library_origin = LOADED_FIRST
     else:
         for library in rank_libraries(find_libraries()):
-            if _loads(library.path):
+            if _can_load(library.path):
                 os.environ[VARIABLE] = str(library.path)
                 _library_origin = BY_MIVOL
                 return

@@ -54,8 +54,8 @@ __all__ = [
     "AUTO", "CAPTURE", "Cone", "Detector", "EXPERIMENTS", "Ellipsoids", "Experiment", "FIELD_KINDS", "FieldExperiment", "Files",
     "GaussianExperiment", "HashExperiment", "KINDS", "Known", "MODELS", "Matrices", "Measured", "NOT_RESULT", "NerfExperiment",
     "Nikon", "OctreeExperiment", "OfData", "Parallel", "PhotoExperiment", "Readings", "Rendered", "ScanExperiment",
-    "SceneExperiment", "Section", "ShowSettings", "SolveSettings", "Sought", "Stack", "Table", "Truth", "apply_change", "flat",
-    "from_dict", "is_circle", "load", "of_photographs", "resolved",
+    "SceneExperiment", "Section", "ShowSettings", "SolveSettings", "Sought", "Stack", "Table", "Truth", "apply_change",
+    "flatten_settings", "from_dict", "is_circle", "load", "of_photographs", "resolved",
 ]  # fmt: skip
 
 DEEP_KEY = re.compile(r"(?<![\w\"'.-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){100}")
@@ -217,14 +217,14 @@ def resolved(experiment: Experiment) -> dict[str, Any]:
     return msgspec.to_builtins(experiment)
 
 
-def flat(tree: Any, prefix: str = "") -> dict[str, Any]:
+def flatten_settings(tree: Any, prefix: str = "") -> dict[str, Any]:
     """Return the settings with effect on the result, by dotted key."""
     if isinstance(tree, dict | list | tuple) and len(tree):
         items = tree.items() if isinstance(tree, dict) else enumerate(tree)
         values: dict[str, Any] = {}
         for key, value in items:
             if prefix or key not in NOT_RESULT:
-                values |= flat(value, f"{prefix}.{key}" if prefix else str(key))
+                values |= flatten_settings(value, f"{prefix}.{key}" if prefix else str(key))
         return values
     return {prefix: tree}
 
@@ -248,15 +248,15 @@ def apply_change(raw: dict[str, Any], change: str) -> None:
     *steps, last = dotted.strip().split(".")
     place: Any = raw
     for step in steps:
-        place = place.setdefault(step, {}) if isinstance(place, dict) else _entry(place, step, change)
+        place = place.setdefault(step, {}) if isinstance(place, dict) else _list_entry(place, step, change)
     if isinstance(place, dict):
         place[last] = value
     else:
-        _entry(place, last, change)
+        _list_entry(place, last, change)
         place[int(last)] = value
 
 
-def _entry(place: Any, step: str, change: str) -> Any:
+def _list_entry(place: Any, step: str, change: str) -> Any:
     if not isinstance(place, list) or not step.isdigit() or int(step) >= len(place):
         raise MivolError(f'--set "{change}": "{step}" does not exist: entries of a list count from 0.')
     return place[int(step)]

@@ -120,7 +120,7 @@ class Example:
         return examples_folder() / (self.folder or name)
 
 
-def _smoke(setting: str) -> StandIn:
+def _smoke_stand_in(setting: str) -> StandIn:
     return StandIn("smoke", setting, (53, 45, 44), 1.8)
 
 
@@ -150,9 +150,9 @@ EXAMPLES: dict[str, Example] = {
     "gaussians": Example(
         "the same things as 3D Gaussians", photographs="photographs.py", folder="still_life", file="gaussians.toml"
     ),
-    "smoke": Example("an absorbing smoke from 16 pictures", _smoke("truth.file")),
-    "white_smoke": Example("a smoke that scatters, under a white sky", _smoke("truth.file")),
-    "lamp": Example("where is the lamp behind a known smoke?", _smoke("scene.define.volume")),
+    "smoke": Example("an absorbing smoke from 16 pictures", _smoke_stand_in("truth.file")),
+    "white_smoke": Example("a smoke that scatters, under a white sky", _smoke_stand_in("truth.file")),
+    "lamp": Example("where is the lamp behind a known smoke?", _smoke_stand_in("scene.define.volume")),
     "tooth": Example("a tooth from synchrotron projections", _SLICES),
     "cloud": Example("a cloud under sun and sky", StandIn("cloud", "truth.file", (26, 37, 32), 0.12)),
 }

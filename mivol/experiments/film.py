@@ -278,7 +278,7 @@ def volume_frames(
     if largest <= 0:
         return [], 0.0
     height = max(1, round(WIDTH * lengths[0] / (frames[0].shape[1] * steps[1:].min())))
-    return [_grey(frame / largest, (WIDTH, height)) for frame in frames], largest
+    return [_to_grey_frame(frame / largest, (WIDTH, height)) for frame in frames], largest
 
 
 def _block_means(grid: NDArray, axis: int) -> NDArray:
@@ -310,6 +310,6 @@ def _projection_matrix(shape: Sequence[int], steps: NDArray, angle: float) -> cs
     return csr_matrix(entries, shape=(count, shape[0] * shape[1]))
 
 
-def _grey(share: NDArray, size: tuple[int, int]) -> NDArray[np.uint8]:
+def _to_grey_frame(share: NDArray, size: tuple[int, int]) -> NDArray[np.uint8]:
     frame = PIL.Image.fromarray(np.round(255 * share).astype(np.uint8)).resize(size, PIL.Image.Resampling.BILINEAR)
     return np.repeat(np.asarray(frame)[..., None], 3, axis=2)

@@ -63,7 +63,7 @@ def run_experiment(context: RunContext) -> Path:
     if getattr(settings, "slabs", None) is not None:
         return run_slabs(context)
     if context.resume:
-        checkpoint.check_settings(context.folder / CHECKPOINT, config.flat(config.resolved(settings)))
+        checkpoint.check_settings(context.folder / CHECKPOINT, config.flatten_settings(config.resolved(settings)))
     choose_back_end(settings.variant, settings.threads)
     kind = KINDS[type(settings)](context)
     kind.record.notes += context.notes
@@ -145,7 +145,7 @@ def complete_fit(
         KeyboardInterrupt: Ctrl-C; the checkpoint has been written.
     """
     course, context = kind.course(), kind.context
-    store = CheckpointFile(run.checkpoint, kind.digests() | config.flat(run.record.config), context.resume)
+    store = CheckpointFile(run.checkpoint, kind.digests() | config.flatten_settings(run.record.config), context.resume)
 
     def measure(problem: Problem) -> dict[str, float]:
         errors = kind.measure(problem)

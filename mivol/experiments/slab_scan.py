@@ -494,7 +494,7 @@ def _results(plan: SlabPlan, state: dict[str, Any]) -> dict[str, float | None]:
 
 def _fingerprint(settings: config.ScanExperiment) -> dict[str, str]:
     """Settings that a resumed run must share, as text."""
-    return {name: str(value) for name, value in config.flat(config.resolved(settings)).items()}
+    return {name: str(value) for name, value in config.flatten_settings(config.resolved(settings)).items()}
 
 
 def _read_state(context: RunContext) -> dict[str, Any]:

@@ -245,7 +245,7 @@ def find_emissive_start(
         raise MivolError(f"the views show nothing in the box of {name}: check the cameras, or set start instead of start_fit.")
     density = np.maximum(density / density.mean(), LEAST)[..., None]
     shape = np.broadcast_to(value.mean() * density, value.shape).astype(np.float32)
-    losses = [_try(problem, optimizer, _reals(problem, start, name, factor * shape)) for factor in FACTORS]
+    losses = [_loss_after_trial(problem, optimizer, _reals_with(problem, start, name, factor * shape)) for factor in FACTORS]
     problem.set_reals(start)
     best = FACTORS[int(np.argmin(losses))]
     return EmissiveStart(best * shape, best, tuple(losses))
@@ -297,7 +297,7 @@ def average_density(field: SphericalGrid, to_world: np.ndarray, shape: tuple[int
     return density.reshape(shape[0], PARTS, shape[1], PARTS, shape[2], PARTS).mean(axis=(1, 3, 5))
 
 
-def _try(problem: SceneProblem, optimizer: Optimizer, reals: dict[str, mi.TensorXf]) -> float:
+def _loss_after_trial(problem: SceneProblem, optimizer: Optimizer, reals: dict[str, mi.TensorXf]) -> float:
     """The loss after the first steps of a fit."""
     problem.set_reals(reals)
     fit = begin_fit(problem, optimizer, TRIAL)
@@ -305,7 +305,7 @@ def _try(problem: SceneProblem, optimizer: Optimizer, reals: dict[str, mi.Tensor
     return problem.loss_value(fit.run.reals, TRIAL)
 
 
-def _reals(problem: SceneProblem, start: dict[str, mi.TensorXf], name: str, value: np.ndarray) -> dict[str, mi.TensorXf]:
+def _reals_with(problem: SceneProblem, start: dict[str, mi.TensorXf], name: str, value: np.ndarray) -> dict[str, mi.TensorXf]:
     """The reals of a problem with another value of a parameter, clipped to the domain."""
     parameter = next(p for p in problem.parameters if p.name == name)
     low, high = parameter.domain

@@ -90,7 +90,7 @@ def is_interrupted(folder: Path, settings: config.Experiment) -> bool:
     from mivol.optim import checkpoint
 
     with suppress(MivolError):
-        checkpoint.check_settings(folder / CHECKPOINT, config.flat(config.resolved(settings)))
+        checkpoint.check_settings(folder / CHECKPOINT, config.flatten_settings(config.resolved(settings)))
         return read_record(folder).status != "finished"
     return False
 
@@ -164,7 +164,8 @@ def plan_sweep(
     for combination in itertools.product(*values.values()):
         chosen = dict(zip(values, combination, strict=True))
         settings = config.load(path, [*changes, *(f"{key}={_to_toml(value)}" for key, value in chosen.items())])
-        digest = hashlib.sha256(msgspec.json.encode(config.flat(config.resolved(settings)), order="sorted")).hexdigest()
+        flat = config.flatten_settings(config.resolved(settings))
+        digest = hashlib.sha256(msgspec.json.encode(flat, order="sorted")).hexdigest()
         name = run_name(chosen)
         runs.append(SweepRun(name if name not in names else f"{name}-{digest[:8]}", chosen, settings, digest))
         names.add(name)
@@ -182,14 +183,14 @@ def run_name(values: dict[str, Any]) -> str:
     words = []
     for key, value in values.items():
         same = [other for other in values if other.rpartition(".")[2] == key.rpartition(".")[2]]
-        words.append(f"{key if len(same) > 1 else key.rpartition('.')[2]}={_plain(value)}")
+        words.append(f"{key if len(same) > 1 else key.rpartition('.')[2]}={_format_value(value)}")
     name = re.sub(r"[^A-Za-z0-9_.=+-]+", "-", "_".join(words))
     if len(name) <= LONGEST_NAME:
         return name
     return f"{name[: LONGEST_NAME - 9]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
-def _plain(value: Any) -> str:
+def _format_value(value: Any) -> str:
     """A value as people write it."""
     return f"{value:g}" if isinstance(value, float) else str(value).lower() if isinstance(value, bool) else str(value)
 
@@ -267,7 +268,7 @@ class SweepFolder:
         return [self._row(run) for run in self.sweep.runs]
 
     def _row(self, run: SweepRun) -> SweepRow:
-        row = SweepRow(run.name, {key: _plain(value) for key, value in run.values.items()})
+        row = SweepRow(run.name, {key: _format_value(value) for key, value in run.values.items()})
         if not self.has(run):
             progress = self.news.progress.get(run.name)
             return row if progress is None else replace(row, status="running", reason=progress)

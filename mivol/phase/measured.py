@@ -162,10 +162,10 @@ def named_medium(name: str) -> MeasuredMedium:
     Raises:
         MivolError: an unknown name; the message suggests the nearest known names.
     """
-    known = {_plain(n): n for n in (*NAMES, *ALIASES)}
-    match = known.get(_plain(name))
+    known = {_normalise_name(n): n for n in (*NAMES, *ALIASES)}
+    match = known.get(_normalise_name(name))
     if match is None:
-        near = difflib.get_close_matches(_plain(name), known, n=3, cutoff=0.5)
+        near = difflib.get_close_matches(_normalise_name(name), known, n=3, cutoff=0.5)
         near = ", ".join(known[n] for n in near) or "milk, skim milk, red wine, ..."
         raise MivolError(f"no measured medium is called {name!r}; near it are {near}: see mivol.phase.measured.NAMES.")
     reduced, sigma_a, g = _TABLE[ALIASES.get(match, match)]
@@ -173,5 +173,5 @@ def named_medium(name: str) -> MeasuredMedium:
     return MeasuredMedium(sigma_a, sigma_s, g)
 
 
-def _plain(name: str) -> str:
+def _normalise_name(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", name.lower())

@@ -226,7 +226,7 @@ class Mixture(mi.PhaseFunction):
             raise MivolError("the weights of mivol_mixture are all 0; at least one above 0 is expected.")
 
     def component_count(self, active: mi.Bool = True) -> int:
-        return sum(_count(lobe) for lobe in self.lobes.values())
+        return sum(_count_components(lobe) for lobe in self.lobes.values())
 
     def flags(self, index: int | mi.Bool | None = None, active: mi.Bool = True) -> int:
         if index is None or isinstance(index, (bool, mi.Bool)):
@@ -299,9 +299,9 @@ class Mixture(mi.PhaseFunction):
         """The name of the lobe of a component, and the component's number inside the lobe."""
         left = index
         for name, lobe in self.lobes.items():
-            if left < _count(lobe):
+            if left < _count_components(lobe):
                 return name, left if lobe.component_count() else ALL_COMPONENTS
-            left -= _count(lobe)
+            left -= _count_components(lobe)
         raise MivolError(f"component {index} of mivol_mixture was requested; the mixture has {self.component_count()}.")
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -317,7 +317,7 @@ class Mixture(mi.PhaseFunction):
         return "mivol_mixture[" + ", ".join(f"{n}={lobe}" for n, lobe in self.lobes.items()) + "]"
 
 
-def _count(lobe: mi.PhaseFunction) -> int:
+def _count_components(lobe: mi.PhaseFunction) -> int:
     """Number of components of a phase function; stock ``rayleigh`` reports 0 and counts as 1."""
     return max(lobe.component_count(), 1)
 

@@ -364,10 +364,10 @@ def plot_error_against_time(
 
 
 def _legend(name: str, ratio: tuple[float, float, float] | None) -> str:
-    return f"{name}\n{_times(ratio)} the time" if ratio else name
+    return f"{name}\n{_format_ratio(ratio)} the time" if ratio else name
 
 
-def _times(ratio: tuple[float, float, float]) -> str:
+def _format_ratio(ratio: tuple[float, float, float]) -> str:
     return f"{ratio[2] / ratio[1]:,.3g} ×" if ratio[2] < 1000 * ratio[1] else f"{ratio[2] / ratio[1]:,.0f} ×"
 
 
@@ -382,7 +382,7 @@ def _draw_arrow(axes: Axes, ratios: Sequence[tuple[float, float, float]]) -> Non
         arrowprops={"arrowstyle": "<->", "color": INK, "shrinkA": 5, "shrinkB": 5, "linewidth": 1.1},
     )
     axes.annotate(
-        _times((error, fast, slow)),
+        _format_ratio((error, fast, slow)),
         (np.sqrt(fast * slow), error),
         (0, 4),
         textcoords="offset points",

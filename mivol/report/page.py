@@ -114,7 +114,7 @@ def _environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(duration=_duration, times=_times, unbroken=_unbroken)
+    environment.filters.update(duration=_duration, times=_format_shape, unbroken=_unbroken)
     return environment
 
 
@@ -148,20 +148,20 @@ def _numbers(record: RunRecord, views: Sequence[ViewRow], volumes: Sequence[Volu
     held_out = _held_out_psnr(record, views)
     seconds, leading, tiles = _total_seconds(record), ("nrmse", "held_out_psnr", "seconds"), []
     if record.results.get("nrmse") is not None:
-        tiles.append(_tile("nrmse", record.results["nrmse"], record.units))
+        tiles.append(_result_tile("nrmse", record.results["nrmse"], record.units))
     if held_out:
         spread = f" ({min(held_out):.1f} to {max(held_out):.1f})" if len(held_out) > 1 else ""
         judged = f": {record.judged}" if record.judged else ""
         tiles.append((f"{np.mean(held_out):.1f}", "dB", f"PSNR, held-out views{spread}{judged}"))
     if seconds:
         tiles.append((*_duration(seconds).split(" "), "total time"))
-    tiles += [_tile(name, value, record.units) for name, value in record.results.items() if name not in leading]
+    tiles += [_result_tile(name, value, record.units) for name, value in record.results.items() if name not in leading]
     shapes = dict.fromkeys(volume.shape for volume in volumes)
-    tiles += [(*_count(math.prod(shape)), f"voxels, {_times(shape)}") for shape in shapes]
+    tiles += [(*_count(math.prod(shape)), f"voxels, {_format_shape(shape)}") for shape in shapes]
     return tiles
 
 
-def _tile(name: str, value: float | None, units: dict[str, str]) -> tuple[str, str, str]:
+def _result_tile(name: str, value: float | None, units: dict[str, str]) -> tuple[str, str, str]:
     quantity = find_quantity(name, units)
     if value is None:
         return "–", "", quantity.label
@@ -194,7 +194,7 @@ def _count(number: int) -> tuple[str, str]:
     return str(number), ""
 
 
-def _times(shape: Sequence[int]) -> str:
+def _format_shape(shape: Sequence[int]) -> str:
     return " × ".join(map(str, shape))
 
 

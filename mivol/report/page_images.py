@@ -112,7 +112,7 @@ def make_view_rows(folder: Path, images: Sequence[Image]) -> ViewRows:
     rows = [_view(name, by_view[name], roles, scales) for name, roles in arrays.items()]
     rows.sort(key=lambda view: not view.held_out)
     first = next((image for roles in by_view.values() for image in roles.values()), None)
-    return ViewRows(rows, [_bar(scales[role], label) for role, label in _bar_labels(scales, first)])
+    return ViewRows(rows, [_colour_bar(scales[role], label) for role, label in _bar_labels(scales, first)])
 
 
 def _load(folder: Path, image: Image) -> NDArray:
@@ -267,7 +267,7 @@ def _bar_labels(scales: dict[str, pixel_scale.Scale], image: Image | None) -> li
     return [(role, label) for role, label in labels.items() if role in scales]
 
 
-def _bar(scale: pixel_scale.Scale, label: str) -> ColourBar:
+def _colour_bar(scale: pixel_scale.Scale, label: str) -> ColourBar:
     stops = pixel_scale.to_pixels(np.linspace(scale.low, scale.high, 17)[None, :], scale)[0]
     gradient = ", ".join("#{:02x}{:02x}{:02x}".format(*stop) for stop in stops)
     # A percentile of zeros may be 1e-16.
@@ -305,9 +305,9 @@ def _volume_view(folder: Path, by_role: dict[str, Volume]) -> VolumeView:
     rows = [_plane(plane, cuts, scales) for plane in first.images] if len(cuts) > 1 else [_planes(first, values)]
     described = by_role["reconstruction"]
     unit = f" [{described.unit}]" if described.unit else ""
-    bars = [_bar(values, f"{described.quantity}{unit}")]
+    bars = [_colour_bar(values, f"{described.quantity}{unit}")]
     if "difference" in scales:
-        bars.append(_bar(scales["difference"], f"Reconstruction − truth{unit}"))
+        bars.append(_colour_bar(scales["difference"], f"Reconstruction − truth{unit}"))
     layers = [_layer(share, grids, scales, first.aspect["xy"]) for share in _layer_heights(reconstruction.shape[0])]
     return VolumeView(described.caption or described.quantity, reconstruction.shape[2::-1], rows, bars, layers)
 

@@ -130,7 +130,7 @@ class _Scene:
             path = self.writer.path_beside(".exr")
             write_exr(path, {"": unfold_sky(_read_image(sky)) * np.float32(scale)})
             # Mitsuba's envmap has its pole along y and its middle column along +z.
-            add(self.root, "emitter", "envmap", filename=path.name, to_world=_rigid(transform) @ SKY_TO_PBRT)
+            add(self.root, "emitter", "envmap", filename=path.name, to_world=_rotation_part(transform) @ SKY_TO_PBRT)
             return
         if each.type == "infinite":
             add(self.root, "emitter", "constant", radiance=to_rgb(each.parameters.get("L"), 1.0, is_light=True) * scale)
@@ -162,7 +162,7 @@ class _Scene:
         is_interface = state.material[0] in ("interface", "", "none")
         if state.medium[1]:
             self.left_out.append(f"the medium {state.medium[1]!r} outside of a shape")
-        if medium is not None and medium.bounds is not None and is_interface and _holds(each, medium.bounds):
+        if medium is not None and medium.bounds is not None and is_interface and _contains_bounds(each, medium.bounds):
             node = add(self.root, "shape", "cube", to_world=medium.bounds @ frame_from_box((0.5,) * 3, (1.0,) * 3))
             is_kept = True
         else:
@@ -236,7 +236,7 @@ def _is_similarity(transform: np.ndarray) -> bool:
     return bool(np.allclose(gram, gram[0, 0] * np.eye(3), rtol=0, atol=1e-6 * gram[0, 0]))
 
 
-def _holds(each: Directive, bounds: np.ndarray) -> bool:
+def _contains_bounds(each: Directive, bounds: np.ndarray) -> bool:
     """Whether a sphere holds the bounds of a grid. Other boundaries stay."""
     if each.type != "sphere":
         return False
@@ -251,7 +251,7 @@ SKY_TO_PBRT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]
 """From the axes of Mitsuba's sky (pole along y) to the axes of pbrt's sky (pole along z)."""
 
 
-def _rigid(transform: np.ndarray) -> np.ndarray:
+def _rotation_part(transform: np.ndarray) -> np.ndarray:
     """The turning part of a transform."""
     matrix = np.eye(4)
     matrix[:3, :3] = transform[:3, :3] / np.linalg.norm(transform[:3, :3], axis=0)

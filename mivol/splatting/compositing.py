@@ -185,7 +185,7 @@ def _covered(q: mi.Float, q_x: mi.Float, q_y: mi.Float) -> mi.Float:
     return dr.clip(0.5 + (1 - m) * dr.rcp(dr.maximum(slope, 1e-9)), 0, 1)
 
 
-def _rest(rest: mi.Float, index: mi.UInt32, there: mi.Bool, depth: bool) -> list[mi.Float]:
+def _gather_blue_and_depth(rest: mi.Float, index: mi.UInt32, there: mi.Bool, depth: bool) -> list[mi.Float]:
     """Blue, and the depth on request."""
     if depth:
         return list(dr.gather(mi.ArrayXf, rest, index, there, shape=(2, dr.width(index))))
@@ -217,7 +217,7 @@ def composite(
         for k in range(CHUNK):
             index, there = lane.splat(lists, chunk * CHUNK + k)
             footprint = _Footprint.of(shape, index, there, lane, grid, frame.discs)
-            splat_colour = footprint.colour + _rest(rest, index, there, frame.depth)
+            splat_colour = footprint.colour + _gather_blue_and_depth(rest, index, there, frame.depth)
             for p in range(PIXELS):
                 a, u = footprint.alpha[p], 1 - footprint.alpha[p]
                 weight = a * clear[p] * most[p]
@@ -270,7 +270,7 @@ def composite_adjoint(splats: tuple[mi.Float, mi.Float], lists: Lists, grid: Gri
             chunk_splats.append((index, there, footprint, list(t)))
             t = [t[p] * (1 - footprint.alpha[p]) for p in range(PIXELS)]
         for index, there, footprint, t in reversed(chunk_splats):
-            splat_colour = [*footprint.colour, *_rest(rest, index, there, frame.depth)]
+            splat_colour = [*footprint.colour, *_gather_blue_and_depth(rest, index, there, frame.depth)]
             d_alpha, d_colour = [], [mi.Float(0) for _ in splat_colour]
             for p in range(PIXELS):
                 value = d_pixels[p][-1]

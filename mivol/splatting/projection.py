@@ -55,7 +55,7 @@ class Cloud:
         """The same numbers as lists of components, each an array of N."""
         count = dr.width(self.opacity_logits)
         flat = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return Cloud(**{name: _columns(flat[name], size, count) for name, size in _sizes(degree).items()})
+        return Cloud(**{name: _columns(flat[name], size, count) for name, size in _numbers_per_gaussian(degree).items()})
 
     def write(self, parts: Cloud) -> None:
         """Write the components of a split cloud, or of its derivatives, into these flat arrays."""
@@ -79,7 +79,7 @@ def _packet(size: int) -> int:
     return math.gcd(size, 16)
 
 
-def _sizes(degree: int) -> dict[str, int]:
+def _numbers_per_gaussian(degree: int) -> dict[str, int]:
     """Numbers of a Gaussian, by tensor."""
     return {"means": 3, "log_scales": 3, "quaternions": 4, "opacity_logits": 1, "harmonics": 3 * (degree + 1) ** 2}
 

@@ -163,7 +163,7 @@ class Splatter:
         if n == 0:
             return self._nothing(cloud, view, shapes)
         shape, rest, depth, faulty, count, radius = self._project(
-            cloud, view, self._filter, self._grid, _blank(8 * n), _blank(2 * n)
+            cloud, view, self._filter, self._grid, _opaque_zeros(8 * n), _opaque_zeros(2 * n)
         )
         _check_faults(np.array(faulty))
         counts = np.array(count)
@@ -210,12 +210,13 @@ class Splatter:
             nothing = np.zeros(0, np.float32)
             gradient |= {"pose": dr.zeros(mi.TensorXf, (6,))} if pose else {}
             return gradient, ScreenStatistics(np.zeros(0, bool), nothing, nothing)
-        adjoint = Adjoint(dr.detach(d_image.array), cache.chunks, _blank(8 * _capacity(n)), _blank(2 * _capacity(n)))
+        zeros = _opaque_zeros(8 * _capacity(n)), _opaque_zeros(2 * _capacity(n))
+        adjoint = Adjoint(dr.detach(d_image.array), cache.chunks, *zeros)
         size = _capacity(n), dr.thread_count()
         if size not in self._composite_adjoints:
             self._composite_adjoints[size] = dr.freeze(composite_adjoint)
         adjoint = self._composite_adjoints[size]((cache.shape, cache.rest), cache.lists, self._grid, cache.frame, adjoint)
-        target = Cloud(*[_blank(int(np.prod(cache.shapes[name]))) for name in NAMES])
+        target = Cloud(*[_opaque_zeros(int(np.prod(cache.shapes[name]))) for name in NAMES])
         d_cloud, by_pose, d_mean2d = self._project_adjoint(cache.cloud, cache.view, self._filter, adjoint, target)
         gradient = {name: mi.TensorXf(getattr(d_cloud, name), cache.shapes[name]) for name in NAMES}
         if pose:
@@ -254,8 +255,8 @@ class Splatter:
     def _frame(self, lists: Lists, derivatives: bool) -> Frame:
         width, height = self.size
         n_chunks = int(lists.chunks[self.n_tiles]) if derivatives else 0
-        transmittance = _blank(max(n_chunks, 1) * LANES * PIXELS)
-        image = _blank(width * height * self.channels)
+        transmittance = _opaque_zeros(max(n_chunks, 1) * LANES * PIXELS)
+        image = _opaque_zeros(width * height * self.channels)
         return Frame(self._width, self._height, image, transmittance, self.depth, self.median, derivatives, self.discs)
 
     def _nothing(
@@ -304,7 +305,7 @@ def _trace_adjoint(
     return target, pose, dr.sqrt(dr.square(derivatives[0]) + dr.square(derivatives[1]))
 
 
-def _blank(size: int) -> mi.Float:
+def _opaque_zeros(size: int) -> mi.Float:
     """Zeros in memory, a number unknown to kernels."""
     return dr.opaque(mi.Float, 0, size)
 

@@ -83,7 +83,7 @@ def zero_nodes(grid: ColumnGrid) -> mi.Float:
 
     The layer is for columns ahead of a ray that has ended, to which only zeros are added.
     """
-    return dr.zeros(mi.Float, 2 * (grid.size + 2 * _spare(grid)))
+    return dr.zeros(mi.Float, 2 * (grid.size + 2 * _spare_nodes(grid)))
 
 
 def backproject_columns(grid: ColumnGrid, target: mi.Float, weight: mi.Float, line: Line) -> None:
@@ -91,7 +91,7 @@ def backproject_columns(grid: ColumnGrid, target: mi.Float, weight: mi.Float, li
 
     The sums of a column are kept while a ray is beside the column, and written once: two pairs a cell.
     """
-    spare = _spare(grid)
+    spare = _spare_nodes(grid)
 
     def write(node: mi.Int32, total: mi.Float, head: mi.Float, on: mi.Bool) -> None:
         pair = mi.Array2f(total - head, head)
@@ -134,7 +134,7 @@ def backproject_columns(grid: ColumnGrid, target: mi.Float, weight: mi.Float, li
 
 def fold_nodes(target: mi.Float, grid: ColumnGrid) -> mi.Float:
     """The sums at the nodes of the grid (flat, Z Y X); sums of the margin are added to the outermost nodes."""
-    above = dr.arange(mi.UInt32, grid.size) + _spare(grid)
+    above = dr.arange(mi.UInt32, grid.size) + _spare_nodes(grid)
     nodes = dr.gather(mi.Float, target, 2 * above) + dr.gather(mi.Float, target, 2 * (above - grid.rise) + 1)
     inner, outer = 1, grid.size
     for n in grid.res[::-1]:
@@ -148,7 +148,7 @@ def fold_nodes(target: mi.Float, grid: ColumnGrid) -> mi.Float:
     return nodes
 
 
-def _spare(grid: ColumnGrid) -> int:
+def _spare_nodes(grid: ColumnGrid) -> int:
     return max(grid.strides)
 
 

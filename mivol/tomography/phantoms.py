@@ -180,12 +180,12 @@ def random_ellipsoids(n: int, seed: int, half_width: float = 1.0) -> EllipsoidPh
 
 def _from_table(table: np.ndarray, centres_turn: bool = False) -> EllipsoidPhantom:
     """With ``centres_turn`` the centres are given in the rotated frame, as in the toft-schabel head."""
-    rotations = np.stack([_euler(*np.radians(row[6:9])) for row in table])
+    rotations = np.stack([_euler_matrix(*np.radians(row[6:9])) for row in table])
     centres = np.einsum("nji,nj->ni", rotations, table[:, 3:6]) if centres_turn else table[:, 3:6]
     return EllipsoidPhantom(rotations / table[:, 0:3, None], centres, table[:, 9])
 
 
-def _euler(phi: float, theta: float, psi: float) -> np.ndarray:
+def _euler_matrix(phi: float, theta: float, psi: float) -> np.ndarray:
     """World to body: z by phi, x by theta, z by psi, the frame turning with the body."""
 
     def about_z(a: float) -> np.ndarray:

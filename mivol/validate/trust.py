@@ -342,7 +342,7 @@ def read_medium_shape(shape: mi.Shape) -> MediumShape:
         grids=tuple(_printed(v, "matrix") for v in volumes if v.class_name() == "GridVolume"),
         surface=surface,
         majorant=scale * sum(float(np.max(v.max())) for v in volumes),
-        skin=scale * _skin(surface + FACE_TOLERANCE * (points.mean(axis=0) - surface), volumes, to_local),
+        skin=scale * _skin_depth(surface + FACE_TOLERANCE * (points.mean(axis=0) - surface), volumes, to_local),
         params={key: params[key] for key in params.keys()},  # noqa: SIM118  (iteration gives pairs)
     )
 
@@ -359,7 +359,7 @@ def _surface(points: np.ndarray, faces: np.ndarray | None, to_world: np.ndarray 
     return points
 
 
-def _skin(points: np.ndarray, volumes: list[mi.Volume], to_local: np.ndarray | None) -> float:
+def _skin_depth(points: np.ndarray, volumes: list[mi.Volume], to_local: np.ndarray | None) -> float:
     """Largest optical depth along the normal that a restarted ray skips at some points, without the scale."""
     it = mi.Interaction3f()
     it.p = mi.Point3f(points.T.astype(np.float32))

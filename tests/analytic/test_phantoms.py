@@ -162,9 +162,9 @@ def test_unusable_geometry_is_refused_in_a_sentence(build, sentence):
 
 
 def _one(a: float, b: float, c: float, phi: float = 0.0, theta: float = 0.0):
-    from mivol.tomography.phantoms import _euler
+    from mivol.tomography.phantoms import _euler_matrix
 
-    rotation = _euler(np.radians(phi), np.radians(theta), 0.0)
+    rotation = _euler_matrix(np.radians(phi), np.radians(theta), 0.0)
     return (rotation / np.array([a, b, c])[:, None])[None], np.zeros((1, 3)), np.ones(1)
 
 

@@ -68,7 +68,7 @@ def test_command_line_overrides_the_file(tmp_path: Path) -> None:
 
 
 def test_flat_names_everything_that_changes_the_result() -> None:
-    flat = config.flat(config.resolved(config.from_dict(raw())))
+    flat = config.flatten_settings(config.resolved(config.from_dict(raw())))
     assert flat["parameter.0.prior.0.weight"] == 0.5
     assert flat["optimizer.beta_1"] == 0.9
     assert not {"title", "output", "threads"} & set(flat)

@@ -41,14 +41,14 @@ def fbp(
     problem: LeastSquares, state: SolverState | None = None, window: str = "ram-lak", cutoff: float = 1.0
 ) -> Iterator[SolverState]:
     """:func:`~mivol.tomography.filtered.filtered_backprojection` of a parallel beam, as a single state."""
-    return _once(filtered_backprojection, problem, state, window, cutoff)
+    return _backproject_once(filtered_backprojection, problem, state, window, cutoff)
 
 
 def fdk(
     problem: LeastSquares, state: SolverState | None = None, window: str = "ram-lak", cutoff: float = 1.0
 ) -> Iterator[SolverState]:
     """:func:`~mivol.tomography.filtered.feldkamp` of a circular cone beam, as a single state."""
-    return _once(feldkamp, problem, state, window, cutoff)
+    return _backproject_once(feldkamp, problem, state, window, cutoff)
 
 
 def check_fbp(problem: LeastSquares, **options: object) -> None:
@@ -81,7 +81,7 @@ def check_prior(problem: LeastSquares) -> None:
         raise MivolError("found a prior with filtered back-projection, expected none: use pcg, or a window and a cutoff.")
 
 
-def _once(
+def _backproject_once(
     method: FilteredBackprojection, problem: LeastSquares, state: SolverState | None, window: str, cutoff: float
 ) -> Iterator[SolverState]:
     a = problem.A
