@@ -55,6 +55,7 @@ PUBLIC = {
     "read_sparse_volume": "files",
     "SparseVolumeData": "files",
     "render_reference": "validate.reference",
+    "run_algotom": "tomography.algotom",
     "write_field": "fields.field_files",
     "write_gaussians": "points",
     "write_points": "points",
@@ -92,6 +93,7 @@ if TYPE_CHECKING:  # for type checkers; at run time __getattr__ imports each nam
     from .scene.load import load_scene as load_scene
     from .scene.pbrt import convert_pbrt as convert_pbrt
     from .splatting import Splatter as Splatter
+    from .tomography.algotom import run_algotom as run_algotom
     from .tomography.geometry import ConeBeam as ConeBeam
     from .tomography.geometry import ParallelBeam as ParallelBeam
     from .tomography.geometry import VoxelGrid as VoxelGrid
