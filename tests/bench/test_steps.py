@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -70,6 +72,26 @@ def test_loops_have_a_row_for_each_film(monkeypatch: pytest.MonkeyPatch) -> None
     answer = study.measure_loops(study.StepsSize(loop_scenes=("tutorial",), films=2, loop_steps=1))
     assert list(answer["rows"]) == ["tutorial, 2^2 x 1", "tutorial, 4^2 x 2"]
     assert answer["least_ratio"] == min(row["ratio"] for row in answer["rows"].values()) > 0
+
+
+def test_first_steps_are_timed_in_processes_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each with an empty folder for kernels; a failed process is named."""
+    calls = []
+
+    def run(code: str, *args: str, env: dict, timeout: float) -> SimpleNamespace:
+        assert list(Path(env["DRJIT_CACHE_DIR"]).iterdir()) == []
+        calls.append(args)
+        slow = args[2] == "mivol"
+        line = json.dumps({"milliseconds": 3000.0 if slow else 1500.0, "launches": 7})
+        return SimpleNamespace(returncode=args[1] == "jade_null_sun", stdout=f"a warning\n{line}\n", stderr="no memory")
+
+    monkeypatch.setattr(study, "run_child", run)
+    answer = study.measure_first(study.StepsSize(loop_scenes=("tutorial",)))
+    assert calls == [(mi.variant(), "tutorial", who) for who in (study.PEER, "mivol")]
+    assert answer["most_seconds"] == 3 and answer["rows"]["tutorial, first step"]["ratio"] == 0.5
+    assert [bar["met"] for bar in study.compare("first", answer)] == [False]
+    with pytest.raises(MivolError, match="first step of prbvolpath ended with True: no memory"):
+        study.measure_first(study.StepsSize(loop_scenes=("jade_null_sun",)))
 
 
 def test_a_scene_that_is_misspelt_is_named() -> None:
