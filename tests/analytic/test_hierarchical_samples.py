@@ -13,7 +13,13 @@ from mivol.fields.nerf import NerfField, NerfSizes
 from mivol.optim.photographs.sampled_problem import find_region, join_slopes
 from mivol.transport.line_integrals.hierarchical_samples import cut_into_strata, merge_rounds
 from mivol.transport.line_integrals.radiance_field import RayBundle, RayGradient
-from mivol.transport.line_integrals.sampled_rays import SampledModel, render_hierarchical, vjp_samples
+from mivol.transport.line_integrals.sampled_rays import (
+    RaySamples,
+    SampledModel,
+    _find_weights,
+    render_hierarchical,
+    vjp_samples,
+)
 from mivol.transport.traversal.lattice import Lattice
 
 SIZES = NerfSizes(depth=2, width=8, skip=0, place=2, direction=1, branch=4, coarse=6, fine=9)
@@ -29,6 +35,15 @@ def rays(count: int) -> RayBundle:
     bundle = RayBundle(mi.Point3f(np.ascontiguousarray(o.T)), mi.Vector3f(np.ascontiguousarray(d.T)))
     dr.eval(bundle.o, bundle.d)
     return bundle
+
+
+def test_weights_of_samples_are_those_of_compositing(variant_rgb: str) -> None:
+    """Two rays of three samples and one, packed: the share of a sample is T before it minus T behind it."""
+    sigma, dt = np.float32([0.5, 2, 1, 3]), np.float32([0.2, 0.4, 1.0, 0.5])
+    samples = RaySamples(mi.UInt32(0, 0, 0, 1), mi.Float(0, 1, 2, 0), mi.Float(dt), mi.UInt32(0, 3), mi.UInt32(3, 1))
+    T = np.exp(-np.concatenate([[0], np.cumsum((sigma * dt)[:3].astype(np.float64))]))
+    wanted = [*(T[:-1] - T[1:]), 1 - np.exp(-1.5)]
+    np.testing.assert_allclose(np.array(_find_weights(samples, mi.Float(sigma))), wanted, rtol=1e-6)
 
 
 @pytest.mark.parametrize("u", [None, 0.37])

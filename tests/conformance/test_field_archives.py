@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -135,17 +136,6 @@ HOSTILE_NERFS = {
 }
 
 
-@pytest.mark.parametrize("case", HOSTILE_NERFS)
-def test_hostile_nerfs_are_refused(variant_rgb: str, tmp_path: Path, case: str) -> None:
-    change, said = HOSTILE_NERFS[case]
-    write_field(tmp_path / "f.npz", nerf())
-    with np.load(tmp_path / "f.npz") as stored:
-        held = dict(stored)
-    np.savez(tmp_path / "f.npz", **held | change)
-    with pytest.raises(MivolError, match=said):
-        read_field(tmp_path / "f.npz")
-
-
 HOSTILE_HASH_GRIDS = {
     "another kind": ({"kind": np.array("hsah")}, 'a field of the kind "hsah"; the kind "hash" or "nerf" is expected'),
     "weights of nothing": (
@@ -158,17 +148,6 @@ HOSTILE_HASH_GRIDS = {
     "other cells": ({"res": np.array([3, 4, 6])}, "15,.* bytes of occupied cells at steps of 0.25 for 140 cells"),
     "no step": ({"step": np.array(0.0)}, "at steps of 0 for 120 cells"),
 }
-
-
-@pytest.mark.parametrize("case", HOSTILE_HASH_GRIDS)
-def test_hostile_hash_grids_are_refused(variant_rgb: str, tmp_path: Path, case: str) -> None:
-    change, said = HOSTILE_HASH_GRIDS[case]
-    write_field(tmp_path / "f.npz", hash_grid())
-    with np.load(tmp_path / "f.npz") as stored:
-        held = dict(stored)
-    np.savez(tmp_path / "f.npz", **held | change)
-    with pytest.raises(MivolError, match=said):
-        read_field(tmp_path / "f.npz")
 
 
 def test_values_that_half_floats_cannot_hold_stay(variant_rgb: str, tmp_path: Path) -> None:
@@ -245,13 +224,26 @@ HOSTILE_FIELDS = {
 }
 
 
-@pytest.mark.parametrize("case", HOSTILE_FIELDS)
-def test_hostile_fields_are_refused(variant_rgb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str) -> None:
-    """One wrong array in a field of 3 x 4 x 5 nodes ends in a message; some of them once ended the process."""
-    change, said = HOSTILE_FIELDS[case]
+def one_node() -> SphericalGrid:
+    """One stored node of 3 x 4 x 5."""
     keep = np.zeros((3, 4, 5), bool)
     keep[0, 0, 0] = True
-    write_field(tmp_path / "f.npz", SphericalGrid.from_dense(*arrays(), CUBE, keep))
+    return SphericalGrid.from_dense(*arrays(), CUBE, keep)
+
+
+HOSTILE = [
+    pytest.param(make, *case, id=f"{make.__name__}: {name}")
+    for make, cases in ((nerf, HOSTILE_NERFS), (hash_grid, HOSTILE_HASH_GRIDS), (one_node, HOSTILE_FIELDS))
+    for name, case in cases.items()
+]
+
+
+@pytest.mark.parametrize(("make", "change", "said"), HOSTILE)
+def test_hostile_fields_are_refused(
+    variant_rgb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Callable, change: dict, said: str
+) -> None:
+    """One wrong array in a field ends in a message; some of them once ended the process."""
+    write_field(tmp_path / "f.npz", make())
     with np.load(tmp_path / "f.npz") as stored:
         held = dict(stored)
     np.savez(tmp_path / "f.npz", **held | change)
