@@ -129,6 +129,8 @@ def test_the_largest_sum_is_that_of_the_fullest_cell() -> None:
     weight = np.random.default_rng(0).uniform(size=100)
     cells = zip(lists.starts[:-1], lists.starts[1:], strict=True)
     assert lists.max_cell_sum(weight) == pytest.approx(max(weight[lists.entries[a:b]].sum() for a, b in cells))
+    first = CellLists(np.eye(4), (1, 1, 1), np.uint32([0, 2, 3]), np.uint32([0, 1, 1]))  # the first cell is the fullest
+    assert first.max_cell_sum(np.array([1.0, 2.0])) == 3
 
 
 def test_what_cannot_be_listed_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

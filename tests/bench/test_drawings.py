@@ -25,6 +25,7 @@ from mivol.bench.studies import (
     representations,
     single_scattering,
     steps,
+    storage,
     tomography,
 )
 from mivol.bench.studies.depth import TABLES
@@ -185,6 +186,16 @@ TABLES_OF = [
         "| 32 + 32 | 20.90 dB / 0.700 | 512 |",
     ]),
     (representations, "samples", {"rate": 1.0}, []),
+    (storage, "storage", {"fitted": [], "kinds": [
+        {"name": name, "sparse": not b, "per_cell": (108.0, b), "scenes": dict.fromkeys(storage.RESOLUTIONS, (2**30, b))}
+        for name, b in (("cells", 54.25), ("nodes", 0))
+    ]}, [
+        "| memory / disk | bytes a cell | 128^3 | 256^3 | 512^3 | 1024^3 |",
+        "| --- | ---: | ---: | ---: | ---: | ---: |",
+        "| cells | 108 / 54.2 | 1 GiB / 54.2 B | 1 GiB / 54.2 B | 1 GiB / 54.2 B | 1 GiB / 54.2 B |",
+        "| nodes | 108 (a kept node) | 1 GiB | 1 GiB | 1 GiB | 1 GiB |",
+        "",
+    ]),
     (steps, "gradients", {"rows": {"a": STEP, "b": {"milliseconds": {"mivol": 1.5}, "launches": {"mivol": 3}}}}, [
         "| scene, film | prbvolpath [ms] | mivol [ms] | ratio | launches |",
         "|---|---|---|---|---|",
