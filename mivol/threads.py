@@ -115,7 +115,7 @@ class CallsAhead:
         self._waiting: list[Future] = []
 
     def submit(self, work: Callable[..., Result], *args: Any) -> Future[Result]:
-        """Begin ``work(*args)`` after the earlier calls; waits for the oldest one if ``MAX_AHEAD`` of them are waiting.
+        """Begin ``work(*args)`` after the earlier calls; waits for the oldest call if ``MAX_AHEAD`` calls are waiting.
 
         Args:
             work: computes with NumPy alone; it must not touch Dr.Jit.

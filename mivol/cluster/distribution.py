@@ -1,7 +1,7 @@
 """Fits on a cluster: which parts of each kind of fit the workers compute, and steps over images of a scene in blocks of views.
 
 Conventions. Steps of scenes and of photographs are sums over views; a scan has products with A and its transpose, sums over
-blocks of views. Everything else of a run stays in the owner's process: it has the whole problem, and takes the steps. A worker
+blocks of views. The rest of a run stays in the owner's process: it has the whole problem, and takes the steps. A worker
 has the inputs and a copy of the problem (:mod:`mivol.cluster.steps`). Losses are added in the order of the blocks.
 
 A block has a few views side by side, and depends on the views only. A fit alone puts more views side by side, so it draws other
@@ -111,7 +111,7 @@ def make_scene_twin(place: Workplace, content: dict[str, Any]) -> SceneTwin:
 
 
 class SharedSceneProblem(SceneProblem):
-    """A problem whose losses and gradients are computed by workers; everything else stays in this process.
+    """A problem whose losses and gradients are computed by workers; the rest stays in this process.
 
     Attributes:
         steps: sends blocks to workers.

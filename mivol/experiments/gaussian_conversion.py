@@ -229,7 +229,7 @@ def mesh_of_gaussians(cloud: Gaussians, low: np.ndarray, high: np.ndarray, resol
 
 
 PAINTED = 4
-"""Views that paint a triangle: those that see its middle most squarely."""
+"""Views that paint a triangle: the views nearest to its normal."""
 
 SLANT = 0.1
 """Least cosine between the normal of a triangle and the direction to a view that paints it."""
@@ -241,7 +241,7 @@ DEEP = 2.0
 def paint_mesh(cloud: Gaussians, mesh: Mesh, low: np.ndarray, high: np.ndarray, resolution: int) -> np.ndarray:
     """The texture of a mesh from splatted views: means of the views that see a texel, weighted by squared cosines.
 
-    Views have twice the pixels of those that made the mesh. Texels that no view sees have the colours of the points.
+    Views have twice the pixels of the views of the mesh. Texels that no view sees have the colours of the points.
 
     Args:
         cloud: Gaussians.
@@ -288,7 +288,7 @@ def paint_mesh(cloud: Gaussians, mesh: Mesh, low: np.ndarray, high: np.ndarray, 
 
 
 def _look_up(view: DepthView, points: np.ndarray, deep: float) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (N, 3) of a view at points, linear between pixels, and whether the view sees each of them."""
+    """Colours (N, 3) of a view at points, linear between pixels, and whether the view sees each point."""
     pixel, depth = project(view.camera, points)
     inside = (depth > 0) & ((pixel >= 0) & (pixel < view.camera.size)).all(axis=1)
     pixel = np.where(inside[:, None], pixel, 0.5)

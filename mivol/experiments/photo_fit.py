@@ -321,7 +321,7 @@ class PhotoFit(FitKind):
 
     def motions(self) -> NDArray | None:
         """Return the motions of the cameras in the fit (photographs, 6): rotation vectors about their positions, in the axes of
-        the world [rad], and translations [length]; None for cameras that stay. Judged views then also have a PSNR with their
+        the world [rad], and translations [length]; None if cameras stay. Judged views then also have a PSNR with their
         own poses aligned.
         """
         return None

@@ -226,7 +226,7 @@ NEWEST = "newest.npz"
 """The volume for viewers; it goes when a run begins anew or ends."""
 
 PHOTOGRAPHS = "photographs.json"
-"""Where the photographs of a fit are: ``path`` from the run folder on, and which of them judge the fit."""
+"""Where the photographs of a fit are: ``path`` from the run folder on, and which photographs judge the fit."""
 
 NEWEST_EDGE = 128
 """Longest edge of the volume for viewers [voxel]: of larger ones every second, third, ... voxel is written."""

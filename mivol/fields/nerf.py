@@ -107,7 +107,7 @@ class NerfSizes:
 
     @property
     def weights(self) -> int:
-        """Weights that a sample passes: those of one network."""
+        """Weights that a sample passes: the weights of a network."""
         return self.size
 
     @property

@@ -39,7 +39,7 @@ VERTICES, INDICES = 34962, 34963
 """Targets of buffer views."""
 
 LINEAR, CLAMP = 9729, 33071
-"""Filter of a texture, and what it shows beyond its edges: the edge."""
+"""Filter of a texture; beyond the edges stand the values at the edge."""
 
 
 class GlbWriter:

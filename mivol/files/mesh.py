@@ -82,7 +82,7 @@ class Atlas:
         return (place + np.where((number % 2 == 1)[:, None, None], self.cell - legs, legs)) / (self.cell * self.columns)
 
     def texels(self) -> tuple[np.ndarray, np.ndarray]:
-        """Weights (2, n * n, 3) of the corners at the texels of a cell, and which of them serve its triangles, bool (2, n * n).
+        """Weights (2, n * n, 3) of the corners at the texels of a cell, and which texels serve its triangles, bool (2, n * n).
 
         Texels beside the longest edge lie one texel outside, where the weight of the first corner is negative.
         """

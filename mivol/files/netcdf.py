@@ -5,7 +5,7 @@ NetCDF-4 is HDF5, read through h5py; the classic format and its 64-bit offsets a
 Conventions (CF). A dimension is an axis by the attribute ``axis`` or ``standard_name`` of its coordinate, or by its name; else
 the last three dimensions are (z, y, x). Coordinates are the centres of voxels, in metres or in a unit that is converted to
 metres. A descending axis is turned around. Uneven steps, as of stretched levels, become even steps of the smallest one: a new
-voxel is the mean of the voxels that it overlaps, so integrals along the axis are kept. ``name[3]`` is entry 3 of the dimension
+voxel is the mean of the overlapped voxels, so integrals along the axis are kept. ``name[3]`` is entry 3 of the dimension
 before the axes.
 
 References: NetCDF Climate and Forecast Metadata Conventions 1.11, chapters 4, 5 and 8; AT3D's ``load_from_netcdf`` (lwc, reff).
@@ -31,7 +31,7 @@ from mivol.files.source import refusal, select_dataset
 from mivol.files.volume import VolumeData, frame_from_steps, to_values
 
 CLASSIC, OFFSETS, WIDE = b"CDF\x01", b"CDF\x02", b"CDF\x05"
-"""First bytes of a classic file, of one with 64-bit offsets, and of one with 64-bit data."""
+"""First bytes of a classic file, a file with 64-bit offsets, and a file with 64-bit data."""
 
 AXES = {
     "x": r"x|[xn]i|x[a-z]{1,2}|nx|i|west_east|lon|longitude|easting|projection_x_coordinate",
@@ -79,7 +79,7 @@ class Variable:
 
 
 def is_netcdf(head: bytes) -> bool:
-    """Whether a file begins as one of the kinds of NetCDF does; NetCDF-4 begins as HDF5."""
+    """Whether a file begins as a kind of NetCDF does; NetCDF-4 begins as HDF5."""
     return head.startswith((CLASSIC, OFFSETS, WIDE, b"\x89HDF\r\n\x1a\n"))
 
 
@@ -89,7 +89,7 @@ def read_netcdf(path: Path, dataset: str | None = None) -> VolumeData:
     Args:
         path: file.
         dataset: name of the variable, by default the only one; ``name[3]`` is entry 3 of a dimension before the axes, counted
-            from 0, and ``name[1,3]`` of two of them.
+            from 0, and ``name[1,3]`` of two dimensions.
 
     Raises:
         MivolError: a damaged file, several variables or times without a choice, coordinates that are no lengths, or numbers

@@ -154,8 +154,8 @@ def check_arrays(name: str, arrays: dict[str, np.ndarray], expected: dict[str, t
 
     Args:
         name: file name, for error messages.
-        arrays: contents of an archive; what is not in ``expected`` is not checked, and what is missing neither.
-        expected: array -> allowed kinds of NumPy types, and its shape; None for any shape.
+        arrays: contents of an archive; only arrays in ``expected`` are checked, and they may be missing.
+        expected: array -> allowed kinds of NumPy types, and its shape; None allows any shape.
 
     Raises:
         MivolError: another type or shape, or values that are not finite.

@@ -1,4 +1,4 @@
-"""Methods of the package algotom on mivol's projections. mivol needs none of them; algotom is never installed with it.
+"""Methods of the package algotom on mivol's projections. mivol runs without them, and never installs algotom.
 
 Conventions. Projections are (views, rows, cols), lowest row first, angles are radians, and columns are counted from 0.
 
@@ -100,7 +100,7 @@ def _find_method(method: str, options: dict[str, Any]) -> Callable[..., Any]:
 
 
 def _half_turns(views: int, angles: np.ndarray | None) -> list[np.ndarray]:
-    """Indices of the views of half turns, each with the view half a turn after the first if there is one."""
+    """Indices of the views of half turns, each with the view half a turn after the first, if the scan has it."""
     if angles is None:
         return [np.arange(views)]
     order = np.argsort(angles, kind="stable")

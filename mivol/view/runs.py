@@ -98,7 +98,7 @@ def _open(path: Path, dataset: str | None, defines: Mapping[str, str] | None, sa
 
 
 def wait_for_run(folder: Path, say: Callable[[str], None]) -> Subject:
-    """The model of a run; waits for the first one of an unfinished run, or for its photographs.
+    """The model of a run; waits for the first model of an unfinished run, or for its photographs.
 
     Raises:
         MivolError: a finished or stopped run without a model.
@@ -129,7 +129,7 @@ def find_model(folder: Path) -> tuple[Path, float] | None:
 
 
 class RunSubject(Subject):
-    """The newest model of a run, or the points of its photographs while there is none.
+    """The newest model of a run, or the points of its photographs before the first model.
 
     Attributes:
         folder: run folder.

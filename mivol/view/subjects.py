@@ -98,7 +98,7 @@ class Subject(ABC):
 
     @property
     def title(self) -> str:
-        """Name on the page, with what is missing."""
+        """Name on the page, with missing parts."""
         return self.name
 
     def first_look(self) -> Look:

@@ -5,7 +5,7 @@
     mivol bench captures --captures FOLDER ... --only poses           # grids from wrong poses, with cameras that move
 
 A capture has the name of its folder, or another name before an equals sign. Each folder holds photographs with their poses, as
-for ``mivol optimize``. Fits are those of the presets ``capture`` (grids) and ``minute`` (Gaussians). Every eighth photograph is
+for ``mivol optimize``. Fits have the presets ``capture`` (grids) and ``minute`` (Gaussians). Every eighth photograph is
 judged and not fitted; at most eight are judged.
 
 One constant at a time takes another value. Each capture is left out once: the value that is best in the mean of the other
@@ -122,7 +122,7 @@ def list_captures(size: CaptureSize) -> dict[str, Path]:
     """Folders of the captures by their names.
 
     Raises:
-        MivolError: no folder, a folder that is missing, or two captures of one name.
+        MivolError: no folder, a folder that is missing, or two captures with the same name.
     """
     pairs = [text.partition("=") if "=" in text else (Path(text).name, "", text) for text in size.captures if text]
     folders = {name: Path(folder) for name, _, folder in pairs}
@@ -182,7 +182,7 @@ def leave_each_out(gains: dict[str, dict[str, float]]) -> dict:
     """Choose the value that is best in the mean of all captures but one, for each capture in turn.
 
     Args:
-        gains: PSNR beside that of the rule [dB], by value and capture.
+        gains: PSNR minus the PSNR of the rule [dB], by value and capture.
 
     Returns:
         ``chosen``: value by the capture left out; ``left_out``: mean gain of the chosen values on the captures left out [dB];

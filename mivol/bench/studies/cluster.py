@@ -89,7 +89,7 @@ def step_seconds(work: Workload, network: Network, workers: int) -> float:
     r"""T(W) [s]: time of a step, or of all units that stream.
 
     The owner has one network connection: it sends each worker the inputs of a step and receives its answer, one after another.
-    Workers compute at the same time. With B units of work of t seconds, W workers (at most B of them have work), S bytes to and
+    Workers compute at the same time. With B units of work of t seconds, W workers (at most B have work), S bytes to and
     from a worker, latency l and bandwidth b, and s seconds of the owner alone,
 
     .. math:: T(W) = s + \lceil B/W \rceil\, t + W\,(l + S/b).

@@ -4,7 +4,7 @@ Conventions. From time to time each camera takes a damped least-squares step (:c
 tiles of its photograph, while the model is constant. Between these corrections the model is fitted, while the cameras are
 constant.
 
-A turn and a shift can look alike, so only their sum is known. A prior on both keeps each of them small. The scene then stays
+A turn and a shift can look alike, so only their sum is known. A prior on both keeps each small. The scene then stays
 where the held-out photographs see it.
 """
 
@@ -37,7 +37,7 @@ class MovingCameras:
     Attributes:
         given: the photographs with their given poses.
         distance: of the subject from the cameras [length].
-        motions: of all cameras.
+        motions: motion of each camera.
         posed: the photographs with the moved cameras.
     """
 
@@ -60,7 +60,7 @@ class MovingCameras:
         return self.motions.motion * self._units
 
     def _move(self, views: np.ndarray, motion: np.ndarray) -> list[Camera]:
-        """All given cameras, some of them after motions (views, 6) [pixel]."""
+        """All given cameras, some after motions (views, 6) [pixel]."""
         cameras = list(self.given.cameras)
         for view, move in zip(views, motion * self._units[views], strict=True):
             cameras[view] = move_camera(cameras[view], move[:3], move[3:])

@@ -323,7 +323,7 @@ def _make_halves(tree: Octree, bricks: np.ndarray) -> np.ndarray:
 
 
 def _octant_surroundings(tree: Octree) -> np.ndarray:
-    """A byte (Z, Y, X) for each octant of two cells an edge: the directions in which it begins a free cube of two octants."""
+    """A byte (Z, Y, X) for each octant of two cells an edge: the directions of free cubes of two octants that begin there."""
     n = 1 << (tree.depth - 1)
     is_filled = np.zeros(n**3, bool)
     octants, _ = _spread(tree.codes >> np.uint64(3), np.maximum(tree.sizes.astype(np.int64) - 1, 0))
