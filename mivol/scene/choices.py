@@ -19,11 +19,13 @@ __all__ = [
     "choose_emission",
     "choose_scattering_points",
     "choose_flights",
+    "choose_image_branches",
     "choose_lamp_rays",
     "choose_lighting",
     "choose_media_light",
     "choose_near_light",
     "describe_orders",
+    "is_branch_noise_open",
     "is_lamp_noise_open",
     "is_near_light_open",
     "choose_shadow_table",
@@ -64,6 +66,13 @@ over 4, point lights: smoke 1.1, CT 1.1 and 1.3."""
 LAMP_RAYS, LAMP_COST, MIN_LAMP_GAIN, MIN_LAMP_SAMPLES = (4, 8, 16), 0.05, 1.2, 1 << 15
 """Own camera rays a sample for lamps in view, the time of one over the time of a path (measured: 0.03 in a room of depth 10,
 0.07 to 0.14 beside glass), the smallest predicted gain, and the samples of an image below which nothing is measured."""
+
+MIN_BRANCHING_SAMPLES, MAX_IMAGE_BRANCHES, MIN_BRANCHING_GAIN = 1 << 16, 4, 1.1
+"""Samples of an image below which no preview measures branches; most branches of a path, which bound the time of an image; and
+the smallest predicted gain in variance x time."""
+
+BRANCH_COST, EVENT_COST = 0.5, 0.5
+"""Time of a branch without scattering events, and of an event, over the time of a camera ray up to its first collision."""
 
 MIN_SIDE_FLIGHT_COSINE = 0.5
 """Mean cosine of a phase function above which side flights pay. Below, samples of the phase function find the light. Measured
@@ -333,6 +342,33 @@ def choose_branches(needs: Needs, settings: Settings, segment: str) -> tuple[boo
         return False, []
     why = "colliding paths cause most noise of derivatives, and few camera rays may collide"
     return True, [Choice("derivatives", "paths branch where they first collide", why)]
+
+
+def is_branch_noise_open(needs: Needs, settings: Settings, segment: str) -> bool:
+    """Whether a preview decides if paths branch at their first collision, in images."""
+    if segment != "free_flight" or settings.scatterings < 2 or not is_scattering_visible(needs, settings):
+        return False
+    return needs.are_samples_independent and needs.film_samples >= MIN_BRANCHING_SAMPLES
+
+
+def choose_image_branches(needs: Needs, settings: Settings, segment: str) -> tuple[int, list[Choice]]:
+    """Choose the number of branches of a path at its first collision, in images; 1 for none.
+
+    With k branches at r times the time of a stem each, variance x time is (A + B / k)(1 + r k).
+    """
+    noise = needs.branch_noise
+    if noise is None or not is_branch_noise_open(needs, settings, segment):
+        return 1, []
+    r = noise.share * (BRANCH_COST + EVENT_COST * noise.events)
+    work = {k: (noise.stem + noise.branch / k) * (1 + r * k) for k in range(1, MAX_IMAGE_BRANCHES + 1)}
+    best = min(work, key=work.get)
+    gain = work[1] / work[best] if work[best] > 0 else 0.0
+    total = noise.stem + noise.branch
+    share = f"light behind first collisions has {noise.branch / total if total > 0 else 0:.0%} of the noise in a preview"
+    if gain < MIN_BRANCHING_GAIN:
+        return 1, [Choice("images", "each path has one end", share)]
+    why = f"{share}, and {noise.share:.0%} of the camera rays collide: the same error {gain:.2g} times as fast"
+    return best, [Choice("images", f"paths have {best} branches behind their first collision", why)]
 
 
 def choose_media_light(needs: Needs, settings: Settings) -> tuple[bool, list[Choice]]:

@@ -22,6 +22,7 @@ from mivol.scene.nesting import shape_bounds
 from mivol.scene.plan import Plan, build_media, make_plan
 from mivol.scene.previews import (
     find_sufficient_depth,
+    measure_branch_noise,
     measure_emitter_noise,
     measure_lamp_noise,
     measure_media_light,
@@ -107,6 +108,7 @@ def explain_scene(
         needs = measure_media_light(scene, eye, needs, survey, settings)
         needs = measure_near_light(scene, eye, needs, survey, settings)
         needs = measure_lamp_noise(scene, eye, needs, survey, settings)
+        needs = measure_branch_noise(scene, eye, needs, survey, settings)
         shares = measure_emitter_noise(scene, eye, needs, survey, settings)
         return Explanation((*facts, *_describe_plan(scene, eye, needs, settings, noise, shares)))
     except MivolError as error:

@@ -29,7 +29,16 @@ from mivol.scene.readings import (
     read_lowest_albedo,
     read_number,
 )
-from mivol.scene.survey import OUTSIDE_SHAPES, Boundary, SceneSurvey, ShapeFacts, find_outside_media, is_instance, survey_scene
+from mivol.scene.survey import (
+    OUTSIDE_SHAPES,
+    Boundary,
+    BranchNoise,
+    SceneSurvey,
+    ShapeFacts,
+    find_outside_media,
+    is_instance,
+    survey_scene,
+)
 from mivol.scene_graph import list_values, traverse
 from mivol.transport.estimators.lighting.emitters import find_bounding_ball
 from mivol.transport.media.body import Body
@@ -346,6 +355,7 @@ class Needs(ShapeFacts):
             before a measurement.
         lamp_noise: measured variances, for one sample of a pixel, of the light of lamps seen directly and of all other light;
             None before a measurement.
+        branch_noise: what a preview measures of paths that branch (:class:`BranchNoise`); None before a measurement.
         media_light: the light that media emit; None without such light, without scattering, or if the light could not be read.
     """
 
@@ -364,6 +374,7 @@ class Needs(ShapeFacts):
     emitter_distances: tuple[float, ...] = ()
     near_gain: float | None = None
     lamp_noise: tuple[float, float] | None = None
+    branch_noise: BranchNoise | None = None
     media_light: MediaLight | None = None
 
     @property
@@ -384,7 +395,7 @@ class Needs(ShapeFacts):
         may_scatter = any("sigma_t" not in key.split(".") for key, _ in differentiated)
         if any(m.emits or (may_scatter and not m.is_scattering) for m in self.media):
             return None
-        return replace(self, lamp_noise=None, **_sort_parameters(differentiated))
+        return replace(self, lamp_noise=None, branch_noise=None, **_sort_parameters(differentiated))
 
     def with_views(self, survey: SceneSurvey, asymmetries: list[mi.Float | None]) -> Needs:
         """The same facts with the media viewed anew: a recording reads their arrays from the scene, all but ``asymmetries``."""

@@ -23,6 +23,7 @@ from mivol.scene.choices import (
     choose_channels,
     choose_emission,
     choose_flights,
+    choose_image_branches,
     choose_lamp_rays,
     choose_lighting,
     choose_media_light,
@@ -109,6 +110,7 @@ class Plan:
         draws_emission: whether scattering points sample the light emitted by media.
         successive_paths: most paths per lane, walked one after the other.
         branches: whether paths branch at their first collision for derivatives.
+        image_branches: branches of a path at its first collision, in images; 1 for none.
         draws_near_light: whether segments of paths draw the light of emitters with a position, in images.
         near_light_in_derivatives: the same, in derivatives.
         near_emitters: numbers of the emitters inside of media.
@@ -131,6 +133,7 @@ class Plan:
     draws_emission: bool = False
     successive_paths: int = 1
     branches: bool = False
+    image_branches: int = 1
     draws_near_light: bool = False
     near_light_in_derivatives: bool = False
     near_emitters: tuple[int, ...] = ()
@@ -212,6 +215,8 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     choices += why
     branches, why = choose_branches(needs, settings, segment)
     choices += why
+    image_branches, why = choose_image_branches(needs, settings, segment)
+    choices += why
     near, near_in_derivatives, why = choose_near_light(needs, settings, segment)
     choices += why
     lamp_rays, why = choose_lamp_rays(needs, settings)
@@ -231,6 +236,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         draws_emission,
         successive,
         branches,
+        image_branches,
         near,
         near_in_derivatives,
         tuple(k for k, distance in enumerate(needs.emitter_distances) if distance == 0),

@@ -33,6 +33,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 
 import drjit as dr
@@ -41,15 +42,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mivol.kernel_recording import is_recording, without_garbage_collection
-from mivol.scene.choices import is_lamp_noise_open, is_near_light_open
+from mivol.scene.choices import is_branch_noise_open, is_lamp_noise_open, is_near_light_open
 from mivol.scene.media_light import SAMPLING_COST
 from mivol.scene.needs import Needs, find_needs
 from mivol.scene.plan import Plan, build_estimators, choose_segment, make_plan
-from mivol.scene.survey import SceneSurvey, survey_scene
+from mivol.scene.survey import BranchNoise, SceneSurvey, survey_scene
 from mivol.scene_graph import traverse
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.path.estimators import Estimators, Settings
+from mivol.transport.path.successive import walk_branching
 from mivol.transport.path.walk import has_one_segment, walk_path
+from mivol.transport.traversal.random_numbers import SpreadSampler
 
 DEPTHS = (2, 3, 6, -1)
 """Compared depths; the last depth, without a limit, is the reference."""
@@ -319,6 +322,54 @@ def measure_lamp_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey:
     return replace(needs, lamp_noise=survey.lamp_noise[sensor.ptr])
 
 
+BRANCH_SIDE, BRANCH_SAMPLES, BRANCH_ROUNDS, BRANCHES = 16, 16, 8, 4
+"""Pixels along an edge of the preview of branches, samples per pixel, independent rounds, and branches of a path."""
+
+
+def measure_branch_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> Needs:
+    """Measure the variances in a pixel of the light of stems, and of branches behind their first collision.
+
+    Arguments as for :func:`measure_media_light`; ``survey`` keeps the variances of each sensor.
+
+    Returns:
+        The needs with the variances. With k branches the variance is A + B / k, so two numbers of branches tell A and B.
+
+    Cost: 65536 camera rays once, and 5 paths for each that collides.
+    """
+    if not is_branch_noise_open(needs, settings, choose_segment(needs, settings)) or is_recording():
+        return needs
+    if sensor.ptr not in survey.branch_noise:
+        with without_garbage_collection(), dr.suspend_grad():
+            plan = make_plan(needs, settings)
+            estimators = build_estimators(scene, needs, plan, settings, survey, for_images=True)
+            survey.branch_noise[sensor.ptr] = _measure_branches(
+                sensor, estimators.without_lamps() if plan.lamp_rays else estimators
+            )
+    return replace(needs, branch_noise=survey.branch_noise[sensor.ptr])
+
+
+def _measure_branches(sensor: mi.Sensor, estimators: Estimators) -> BranchNoise:
+    """The variances of pixels spread over the film, between rounds of samples that are spread over each pixel."""
+    pixel, size, cells = _middle_pixels(sensor, BRANCH_SIDE)
+    n = cells * BRANCH_ROUNDS * BRANCH_SAMPLES
+    lane = dr.arange(mi.UInt32, n)
+    pixel = pixel(lane % (cells * BRANCH_SAMPLES) // BRANCH_SAMPLES)
+    seed = lane // (cells * BRANCH_SAMPLES) + CELL_SEED
+    sampler = SpreadSampler.of_pixels(mi.Vector2i(pixel), seed, lane % BRANCH_SAMPLES, dr.opaque(mi.UInt32, BRANCH_SAMPLES))
+    place = (mi.Point2f(pixel) + sampler.next_2d()) / size
+    ray, weight = _camera_ray(sensor, place)
+    variances = []
+    for count in (1, BRANCHES):
+        L, _, depth = walk_branching(estimators, sampler.clone(), ray, count)
+        light = np.array(L * weight, np.float64).reshape(-1, BRANCH_ROUNDS, cells, BRANCH_SAMPLES).mean(axis=3)
+        variances.append(float(light.var(axis=1, ddof=1).mean()))
+    one, several = variances
+    branch = max(one - several, 0.0) * BRANCHES / (BRANCHES - 1)
+    events = np.array(depth)
+    hit = events > 0
+    return BranchNoise(max(one - branch, 0.0), branch, float(hit.mean()), float(events[hit].mean()) if hit.any() else 0.0)
+
+
 SWITCHES = ("radiance.value", "intensity.value", "irradiance.value", "scale")
 """Parameters of an emitter that are 0 without its light; the first that it has counts."""
 
@@ -378,19 +429,26 @@ def _name_emitter(scene: mi.Scene, emitter: mi.Emitter, number: int) -> str:
 
 def _measure_pixel_variance(sensor: mi.Sensor, estimators: Estimators) -> float:
     """Variance of one sample in a pixel, mean over pixels spread over the film."""
-    width, height = (int(n) for n in sensor.film().crop_size())
-    columns, rows = min(width, LAMP_SIDE), min(height, LAMP_SIDE)
-    n = columns * rows * LAMP_SAMPLES
+    pixel, size, cells = _middle_pixels(sensor, LAMP_SIDE)
+    n = cells * LAMP_SAMPLES
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(CELL_SEED, n)
-    chosen = dr.arange(mi.UInt32, n) // LAMP_SAMPLES
-    # The middle pixel of each cell.
-    pixel = mi.Vector2u(
-        (2 * (chosen % columns) + 1) * width // (2 * columns), (2 * (chosen // columns) + 1) * height // (2 * rows)
-    )
-    place = (mi.Point2f(pixel) + sampler.next_2d()) / mi.ScalarVector2f(width, height)
+    place = (mi.Point2f(pixel(dr.arange(mi.UInt32, n) // LAMP_SAMPLES)) + sampler.next_2d()) / size
     L = _walk_from(sensor, estimators, sampler, place)
-    return float(L.reshape(columns * rows, LAMP_SAMPLES).var(axis=1, ddof=1).mean())
+    return float(L.reshape(cells, LAMP_SAMPLES).var(axis=1, ddof=1).mean())
+
+
+def _middle_pixels(sensor: mi.Sensor, side: int) -> tuple[Callable[[mi.UInt32], mi.Vector2u], mi.ScalarVector2f, int]:
+    """The middle pixel of each of at most side x side cells of a film by its number, the film's size, and their count."""
+    width, height = (int(n) for n in sensor.film().crop_size())
+    columns, rows = min(width, side), min(height, side)
+
+    def pixel(cell: mi.UInt32) -> mi.Vector2u:
+        return mi.Vector2u(
+            (2 * (cell % columns) + 1) * width // (2 * columns), (2 * (cell // columns) + 1) * height // (2 * rows)
+        )
+
+    return pixel, mi.ScalarVector2f(width, height), columns * rows
 
 
 def sampling_gain(met: NDArray, drawn: NDArray) -> float:
@@ -422,6 +480,11 @@ def _walk_cells(sensor: mi.Sensor, estimators: Estimators, side: int, samples: i
 
 def _walk_from(sensor: mi.Sensor, estimators: Estimators, sampler: mi.Sampler, place: mi.Point2f) -> NDArray:
     """Mean radiance over all colours of a path from each place on the film."""
-    ray, weight = sensor.sample_ray_differential(mi.Float(sensor.shutter_open()), mi.Float(0.5), place, mi.Point2f(0.5))
+    ray, weight = _camera_ray(sensor, place)
     score, _ = walk_path(estimators, sampler, ray, Primal(dr.zeros(mi.Spectrum, dr.width(ray))))
     return np.array(score.L * weight, np.float64).reshape(-1, dr.width(ray)).mean(axis=0)
+
+
+def _camera_ray(sensor: mi.Sensor, place: mi.Point2f) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+    """The ray through the middle of the lens from each place on the film, and its weight."""
+    return sensor.sample_ray_differential(mi.Float(sensor.shutter_open()), mi.Float(0.5), place, mi.Point2f(0.5))

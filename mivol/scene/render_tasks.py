@@ -26,7 +26,7 @@ from mivol.transport.media.medium_view import read_asymmetry
 from mivol.transport.path.derivatives import prepare_derivatives, replay_branches
 from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.film import CameraRays, LightOfOwnRays, RenderSamples, adjoint_rays, count_passes, render_on_film
-from mivol.transport.path.successive import paths_per_lane, walk_successively
+from mivol.transport.path.successive import paths_per_lane, walk_branching, walk_successively
 from mivol.transport.path.walk import has_one_segment, walk_path
 from mivol.transport.traversal.box import with_placements
 
@@ -221,6 +221,9 @@ class TangentTask(RenderTask):
 
 
 def _render_primal(estimators: Estimators, rays: CameraRays, plan: Plan, aovs: list[str]) -> tuple:
+    if plan.image_branches > 1:
+        L, alpha, _ = walk_branching(estimators, rays.sampler, rays.ray, plan.image_branches)
+        return L, alpha, integrate_aovs(estimators.media, rays.ray, aovs)
     count = paths_per_lane(plan.successive_paths, dr.width(rays.ray))
     if count > 1:
         L, alpha = walk_successively(estimators, rays.sampler, rays.ray, count)

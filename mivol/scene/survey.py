@@ -35,6 +35,22 @@ OUTSIDE_SHAPES = "space around shapes"
 """Class of shape of a medium that fills no shape."""
 
 
+@dataclass(frozen=True)
+class BranchNoise:
+    """What a preview measures of paths up to and behind their first collision.
+
+    Attributes:
+        stem, branch: variance in a pixel of the light of a stem (up to and at its first collision), and of a branch behind it.
+        share: share of camera rays with a collision [1].
+        events: mean number of scattering events of a branch.
+    """
+
+    stem: float
+    branch: float
+    share: float
+    events: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class ShapeFacts:
     """The facts about shapes and emitters.
@@ -90,6 +106,7 @@ class SceneSurvey:
             measurement.
         near_gain: measured gain of drawing the light of near emitters along segments [1]; None before a measurement.
         lamp_noise: measured variances of the light of lamps seen directly, and of all other light, by sensor.
+        branch_noise: what previews have measured of branching paths, by sensor.
     """
 
     boundaries: tuple[Boundary, ...]
@@ -111,6 +128,7 @@ class SceneSurvey:
     gain_of_draws: float | None = None
     near_gain: float | None = None
     lamp_noise: dict[int, tuple[float, float]] = field(default_factory=dict)
+    branch_noise: dict[int, BranchNoise] = field(default_factory=dict)
 
     @property
     def usable_tracer(self) -> mi.Scene | None:

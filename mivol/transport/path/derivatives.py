@@ -32,9 +32,9 @@ from mivol.transport.estimators.scores import Factor, Primal, Replay, Rest
 from mivol.transport.estimators.segment import SegmentTransmittance
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays
-from mivol.transport.path.walk import FirstCollision, gather_lanes, walk_branch, walk_path, walk_stem
+from mivol.transport.path.walk import FirstCollision, walk_branch, walk_path, walk_stem
 from mivol.transport.traversal.random_numbers import SpreadSampler
-from mivol.transport.traversal.rays import FineRay, clip_camera_ray
+from mivol.transport.traversal.rays import clip_camera_ray
 
 __all__ = ["count_branches", "prepare_derivatives", "replay_branches"]
 
@@ -89,7 +89,7 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
     first, replayed_sampler, replayed = sampler.clone(), sampler.clone(), estimators.replayed()
 
     # -- The radiance of stems and branches ------------------------------------------------------------------------------
-    stems, collision = walk_stem(replayed, sampler, rays.ray, Primal(dr.zeros(mi.Spectrum, n)))
+    stems, collision, _ = walk_stem(replayed, sampler, rays.ray, Primal(dr.zeros(mi.Spectrum, n)))
     baseline = estimators.segment.baseline
     light, lane = _PackedLight.of(stems.L), dr.arange(mi.UInt32, n)
     dr.schedule(dL)
@@ -209,8 +209,7 @@ class _Branching:
         on = number < self.count * self.each
         stem = dr.gather(mi.UInt32, self.collided, number // self.each, on)
         sampler = self.sampler.gather(stem).branch(number % self.each, self.each)
-        branches = _Branches(stem, _gather_collisions(self.collision, stem), sampler)
-        branches.collision.on &= on
+        branches = _Branches(stem, self.collision.gather(stem, on), sampler)
         return branches
 
 
@@ -231,14 +230,6 @@ class _Branches:
     def walk(self, estimators: Estimators, score: Primal | Replay) -> tuple[Primal | Replay, mi.UInt32]:
         """Walk the branches to their ends; return the score and the number of scattering events of each."""
         return walk_branch(estimators, self.sampler.clone(), self.collision, score)
-
-
-def _gather_collisions(collision: FirstCollision, index: mi.UInt32) -> FirstCollision:
-    ray = collision.ray
-    o, d, maxt, time = (gather_lanes(values, index) for values in (ray.o, ray.d, ray.maxt, ray.time))
-    state = (collision.t, collision.body, collision.beta, collision.eta, collision.depth, collision.on)
-    rest = (gather_lanes(values, index) for values in state)
-    return FirstCollision(FineRay(o, d, maxt, time, ray.wavelengths), *rest)
 
 
 @dataclass

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import drjit as dr
 import mitsuba as mi
@@ -59,6 +59,12 @@ class PathEvent:
         n = dr.width(collision.on)
         si, t, nowhere = dr.zeros(mi.SurfaceInteraction3f, n), mi.Float(0), dr.full(mi.Bool, False, n)
         return cls(si, t, collision.mei.medium, nowhere, collision, chance)
+
+    def begin_at(self, collision: Collision) -> PathEvent:
+        """The events, with those of paths beginning at collisions in the lanes of these."""
+        on = collision.on
+        merged = {f.name: dr.select(on, getattr(collision, f.name), getattr(self.collision, f.name)) for f in fields(Collision)}
+        return PathEvent(self.si, self.t, self.medium, self.at_surface & ~on, Collision(**merged), self.chance)
 
     def vertex(self, media: SceneMedia) -> Vertex:
         """The point at which light is scattered."""

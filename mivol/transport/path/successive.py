@@ -20,11 +20,21 @@ from mivol.transport.estimators.lighting.tabulated_shadows import KeptShadow
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.estimators.segment import KnownFlight
 from mivol.transport.path.estimators import Estimators
-from mivol.transport.path.walk import Path, advance_path, film_alpha, gather_lanes, leave_camera, start_path
+from mivol.transport.path.walk import (
+    Path,
+    advance_branch,
+    advance_path,
+    film_alpha,
+    gather_lanes,
+    leave_camera,
+    start_branch,
+    start_path,
+    walk_stem,
+)
 from mivol.transport.traversal.random_numbers import SpreadSampler
 from mivol.transport.traversal.rays import clip_camera_ray
 
-__all__ = ["paths_per_lane", "walk_successively"]
+__all__ = ["paths_per_lane", "walk_branching", "walk_successively"]
 
 
 MIN_LANES = {"llvm": 1 << 13, "cuda": 1 << 20, "metal": 1 << 20}
@@ -64,6 +74,10 @@ def paths_per_lane(limit: int, paths: int) -> int:
     return max(1, min(limit, paths // MIN_LANES[backend]))
 
 
+def lanes_of_branches(paths: int) -> int:
+    return max(min(paths, MIN_LANES[mi.variant().split("_")[0]]), paths // 16)
+
+
 def walk_successively(
     estimators: Estimators, sampler: SpreadSampler, ray: mi.Ray3f, count: int
 ) -> tuple[mi.Spectrum, mi.Float]:
@@ -81,15 +95,16 @@ def walk_successively(
     Bias, variance: as for :func:`mivol.transport.path.walk.walk_path`. Memory: 16 numbers a path, 34 with tabulated shadows.
     """
     n = dr.width(ray)
-    lanes, per_lane = -(-n // count), dr.opaque(mi.UInt32, count)
+    lanes = -(-n // count)
+    taken, number = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, n)
     clipped, medium, sampler = clip_camera_ray(ray), estimators.media.medium_at(ray), sampler.clone()
     known = estimators.segment.find_first_collision(clipped, medium, sampler, dr.full(mi.Bool, True, n))
     starts = _PathStarts(clipped, medium, sampler, known)
     L, alpha = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Float, n)
     kept = KeptShadow.empty(n) if estimators.tabulates_shadows else None
     dr.eval(starts, L, alpha, kept)
-    index = dr.arange(mi.UInt32, lanes) * per_lane
-    end = dr.minimum(index + per_lane, dr.opaque(mi.UInt32, n))
+    zero = dr.zeros(mi.UInt32, lanes)
+    nowhere = dr.full(mi.Bool, False, lanes)
 
     def start(index: mi.UInt32, active: mi.Bool) -> Path:
         ray, medium, sampler, known = starts.gather(index, active)
@@ -97,21 +112,102 @@ def walk_successively(
         path.known = known
         return leave_camera(estimators, path, medium)
 
-    def advance(path: Path, index: mi.UInt32) -> tuple[Path, mi.UInt32]:
+    def advance(path: Path, index: mi.UInt32, walks: mi.Bool) -> tuple[Path, mi.UInt32, mi.Bool]:
         path = advance_path(estimators, path)
         ended = ~path.active
-        dr.scatter(L, path.score.L, index, ended)
-        dr.scatter(alpha, film_alpha(path), index, ended)
+        done = ended & (index < number)
+        dr.scatter(L, path.score.L, index, done)
+        dr.scatter(alpha, film_alpha(path), index, done)
         if kept is not None:
-            kept.scatter(path.tabulated, index, ended)
-        index += dr.select(ended, mi.UInt32(1), mi.UInt32(0))
-        return dr.select(ended, start(index, ended & (index < end)), path), index
+            kept.scatter(path.tabulated, index, done)
+        index = dr.select(ended, dr.scatter_inc(taken, zero, ended), index)
+        walks = index < number
+        return dr.select(ended, start(index, ended & walks), path), index, walks
 
+    index = dr.full(mi.UInt32, 0xFFFFFFFF, lanes)
     dr.while_loop(
-        state=(start(index, index < end), index), cond=lambda path, _: path.active, body=advance, label="successive paths"
+        state=(start(index, nowhere), index, ~nowhere),
+        cond=lambda path, index, walks: walks,
+        body=advance,
+        label="successive paths",
     )
     dr.eval(L, alpha, kept)
     if kept is not None:
         # Here every lane has one shadow ray, and none waits for the longer path of another.
         L += kept.light_at_camera(estimators.media, starts.ray)
     return L, alpha
+
+
+def walk_branching(
+    estimators: Estimators, sampler: SpreadSampler, ray: mi.Ray3f, count: int
+) -> tuple[mi.Spectrum, mi.Float, mi.UInt32]:
+    """Walk paths from the camera that branch at their first collision with a medium.
+
+    A lane walks all branches of a stem in succession, so the sum of their light does not depend on the threads.
+
+    Args:
+        estimators: estimators of the render; their segments end in media.
+        sampler: random numbers of each path.
+        ray: camera rays in world space with unit directions, one for each path.
+        count: number of branches of a path.
+
+    Returns:
+        The radiance, the alpha (in [0, 1]), and the number of scattering events of the last branch (0 without a collision) of
+        each path.
+
+    Bias: none. Variance: A + B / count, with the variance A of stems and B of a branch. Memory: 40 numbers a path, 58 with
+    tabulated shadows.
+    """
+    n, first = dr.width(ray), sampler.clone()
+    stems, collision, alpha = walk_stem(estimators, sampler, ray, Primal(dr.zeros(mi.Spectrum, n)))
+    number, taken, collided = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 0), dr.zeros(mi.UInt32, n)
+    dr.scatter(collided, dr.arange(mi.UInt32, n), dr.scatter_inc(number, mi.UInt32(0), collision.on), collision.on)
+    L, depth = dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n)
+    kept = KeptShadow.empty(n) if estimators.tabulates_shadows else None
+    dr.eval(stems.L, alpha, collision, first, number, collided, L, depth, kept)
+    # -- The branches: each lane has some stems ----------------------------------------------------------------------------
+    lanes = lanes_of_branches(n)
+    each = dr.opaque(mi.UInt32, count)
+    zero = dr.zeros(mi.UInt32, lanes)
+
+    def take(branch: mi.UInt32, stem: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32, mi.Bool]:
+        """The next branch of the stem of each lane, or the first of the next stem."""
+        branch = branch + 1
+        done = active & (branch == each)
+        place = dr.scatter_inc(taken, zero, done)
+        stem = dr.select(done, dr.gather(mi.UInt32, collided, place, done & (place < number)), stem)
+        return dr.select(done, 0, branch), stem, active & (~done | (place < number))
+
+    def start(branch: mi.UInt32, stem: mi.UInt32, active: mi.Bool, score: Primal) -> tuple[Path, KnownFlight]:
+        at = collision.gather(stem, active)
+        path = start_branch(estimators, first.gather(stem, active).branch(branch, each), at, score)
+        return path, KnownFlight(at.t, at.body, active)
+
+    def advance(path: Path, begun: KnownFlight, branch: mi.UInt32, stem: mi.UInt32, walks: mi.Bool) -> tuple:
+        path = advance_branch(estimators, path, begun)
+        ended, last = ~path.active, branch + 1 == each
+        done = ended & last & (stem < n)
+        dr.scatter(L, path.score.L, stem, done)
+        dr.scatter(depth, path.depth, stem, done)
+        if kept is not None:
+            kept.scatter(path.tabulated, stem, done)
+        next_branch, next_stem, active = take(branch, stem, ended)
+        again, fresh = start(next_branch, next_stem, active, Primal(dr.select(last, 0, path.score.L)))
+        if kept is not None:
+            again.tabulated = dr.select(last, again.tabulated, path.tabulated)
+        branch, stem = dr.select(ended, next_branch, branch), dr.select(ended, next_stem, stem)
+        walks = active | ~ended
+        return dr.select(ended, again, path), dr.select(ended, fresh, begun.forget()), branch, stem, walks
+
+    nowhere, stem = dr.full(mi.Bool, False, lanes), dr.full(mi.UInt32, 0xFFFFFFFF, lanes)
+    path, begun = start(zero, stem, nowhere, Primal(dr.zeros(mi.Spectrum, lanes)))
+    dr.while_loop(
+        state=(path, begun, mi.UInt32(each - 1) + zero, stem, ~nowhere),
+        cond=lambda *state: state[-1],
+        body=advance,
+        label="branches",
+    )
+    dr.eval(L, depth, kept)
+    if kept is not None:
+        L += kept.light_at_camera(estimators.media, ray)
+    return stems.L + L * dr.rcp(mi.Float(each)), alpha, depth

@@ -52,11 +52,13 @@ from mivol.transport.traversal.rays import FineRay, Ray, clip_camera_ray, point_
 __all__ = [
     "FirstCollision",
     "Path",
+    "advance_branch",
     "advance_path",
     "film_alpha",
     "gather_lanes",
     "has_one_segment",
     "leave_camera",
+    "start_branch",
     "start_path",
     "walk_branch",
     "walk_path",
@@ -173,6 +175,14 @@ class FirstCollision:
             self.on | on,
         )
 
+    def gather(self, index: mi.UInt32, active: mi.Bool = True) -> FirstCollision:
+        """The collisions of other lanes, on where ``active``."""
+        ray = self.ray
+        o, d, maxt, time = (gather_lanes(values, index, active) for values in (ray.o, ray.d, ray.maxt, ray.time))
+        state = (self.t, self.body, self.beta, self.eta, self.depth, self.on)
+        t, body, beta, eta, depth, on = (gather_lanes(values, index, active) for values in state)
+        return FirstCollision(FineRay(o, d, maxt, time, ray.wavelengths), t, body, beta, eta, depth, on & active)
+
 
 def start_path(
     estimators: Estimators,
@@ -278,7 +288,7 @@ def walk_path(
     return path.score, film_alpha(path)
 
 
-def walk_stem(estimators: Estimators, sampler: SpreadSampler, ray: Ray, score: Score) -> tuple[Score, FirstCollision]:
+def walk_stem(estimators: Estimators, sampler: SpreadSampler, ray: Ray, score: Score) -> tuple[Score, FirstCollision, mi.Float]:
     """Walk a path from the camera, and stop at its first collision with a medium.
 
     Args:
@@ -286,7 +296,7 @@ def walk_stem(estimators: Estimators, sampler: SpreadSampler, ray: Ray, score: S
         sampler, ray, score: as in :func:`walk_path`.
 
     Returns:
-        The score, and the first collisions, from which :func:`walk_branch` continues.
+        The score, the first collisions, from which :func:`walk_branch` continues, and the alpha for the film, in [0, 1].
     """
     media, n = estimators.media, dr.width(ray)
     path = start_path(estimators, clip_camera_ray(ray), score, sampler, dr.full(mi.Bool, True, n))
@@ -310,7 +320,7 @@ def walk_stem(estimators: Estimators, sampler: SpreadSampler, ray: Ray, score: S
         path, first = dr.while_loop(state=(path, first), cond=lambda path, first: path.active, body=advance, label="stem")
     else:
         path, first = advance(path, first)
-    return _add_reservoirs(estimators, path).score, first
+    return _add_reservoirs(estimators, path).score, first, dr.select(first.on, 1, film_alpha(path))
 
 
 def walk_branch(
@@ -326,12 +336,17 @@ def walk_branch(
     Returns:
         The score, and the number of scattering events of the path.
     """
-    path = start_path(estimators, collision.ray, score, sampler, mi.Bool(collision.on))
-    path.beta, path.eta, path.depth = mi.Spectrum(collision.beta), mi.Float(collision.eta), mi.UInt32(collision.depth)
-    path = _sample_first_emitter(estimators, _start_reservoirs(estimators, path, "later"))
+    path = start_branch(estimators, sampler, collision, score, "later")
     hit = make_collision(estimators.media, collision.ray, collision.t, collision.body, collision.on)
     path = _walk_to_end(estimators, _scatter(estimators, path, PathEvent.from_collision(hit, sampler.next_1d())))
     return _add_reservoirs(estimators, path).score, path.depth
+
+
+def start_branch(estimators: Estimators, sampler: SpreadSampler, collision: FirstCollision, score: Score, *probes: str) -> Path:
+    """A path that continues from its first collision (see :func:`_start_reservoirs` for ``probes``)."""
+    path = start_path(estimators, collision.ray, score, sampler, mi.Bool(collision.on))
+    path.beta, path.eta, path.depth = mi.Spectrum(collision.beta), mi.Float(collision.eta), mi.UInt32(collision.depth)
+    return _sample_first_emitter(estimators, _start_reservoirs(estimators, path, *probes))
 
 
 def advance_path(estimators: Estimators, path: Path) -> Path:
@@ -339,6 +354,17 @@ def advance_path(estimators: Estimators, path: Path) -> Path:
     path, event = _follow_segment(estimators, path)
     path = _add_emitted_light(estimators, path, event)
     return _scatter(estimators, path, event)
+
+
+def advance_branch(estimators: Estimators, path: Path, start: KnownFlight) -> Path:
+    """Advance a path; lanes of ``start`` are at a collision on the segment already, and scatter there."""
+    beta, active = mi.Spectrum(path.beta), path.active
+    path.active = active & ~start.on
+    path, event = _follow_segment(estimators, path)
+    path = _add_emitted_light(estimators, path, event)
+    path.active, path.beta = active, dr.select(start.on, beta, path.beta)
+    hit = make_collision(estimators.media, path.ray, start.t, start.body, active & start.on)
+    return _scatter(estimators, path, event.begin_at(hit))
 
 
 def _walk_to_end(estimators: Estimators, path: Path) -> Path:
