@@ -336,7 +336,10 @@ def measure_branch_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, surve
 
     Cost: 65536 camera rays once, and 5 paths for each that collides.
     """
-    if not is_branch_noise_open(needs, settings, choose_segment(needs, settings)) or is_recording():
+    # A camera of several views is not measured: Mitsuba's keeps arrays that recordings do not know.
+    if sensor.class_name() == "BatchSensor" or is_recording():
+        return needs
+    if not is_branch_noise_open(needs, settings, choose_segment(needs, settings)):
         return needs
     if sensor.ptr not in survey.branch_noise:
         with without_garbage_collection(), dr.suspend_grad():

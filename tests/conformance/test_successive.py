@@ -1,8 +1,11 @@
-"""Paths that a lane walks one after the other: each is walked once, as if alone, and a plan takes them where they pay."""
+"""Paths and branches that a lane walks one after the other: each is walked once, as if alone, and a plan takes them where they
+pay."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -12,28 +15,31 @@ from false_alarms import assert_precise, assert_same_mean, difference, over_pixe
 from scattering_scenes import PLACE, close_up, mivol, moments, rough_grid, smoke, sun
 
 from mivol.experiments.script import explain
+from mivol.scene import choices, plan
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import build_estimators, make_plan
-from mivol.scene.survey import survey_scene
+from mivol.scene.survey import BranchNoise, survey_scene
+from mivol.transport.estimators.scores import Primal
 from mivol.transport.path import successive
 from mivol.transport.path.estimators import Settings
 from mivol.transport.path.film import RenderSamples, film_passes
-from mivol.transport.path.successive import paths_per_lane, walk_successively
-from scenes import box_of, medium, sky
+from mivol.transport.path.successive import paths_per_lane, walk_branching, walk_successively
+from mivol.transport.path.walk import walk_path
+from scenes import ball_of, box_of, grid_volume, medium, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 ENDLESS = mivol(max_depth=-1)
 
 
-def radiance(scene: mi.Scene, count: int) -> np.ndarray:
+def radiance(scene: mi.Scene, count: int, walk: Callable = walk_successively) -> np.ndarray:
     """Radiance and alpha (4, 3 * 8 * 8) of three samples per pixel."""
     settings, sensor, survey = Settings(max_depth=-1), scene.sensors()[0], survey_scene(scene)
     with dr.suspend_grad():
         needs = find_needs(scene, sensor, survey, 3)
         estimators = build_estimators(scene, needs, make_plan(needs, settings), settings, survey, for_images=True)
         rays = next(film_passes(RenderSamples(sensor, 5, 3, 1 << 20)))
-        L, alpha = walk_successively(estimators, rays.sampler, rays.ray, count)
+        L, alpha, *_ = walk(estimators, rays.sampler, rays.ray, count)
     return np.array([*L, alpha])
 
 
@@ -117,3 +123,100 @@ def test_they_keep_the_mean(monkeypatch: pytest.MonkeyPatch) -> None:
     found = over_pixels(moments(scene, ENDLESS, 256, first=100))
     assert_same_mean(found, together, rounding=1e-6, what="radiance")
     assert_precise(difference(found, together), 0.03 * together.mean, what="radiance")
+
+
+# -- Branches ------------------------------------------------------------------------------------------------------------------
+
+
+def test_branches_do_not_depend_on_their_lane(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each camera ray has the same light, to the last bit, if a lane walks the branches of 1 or of 16 rays."""
+    backend, found = mi.variant().split("_")[0], []
+    for lanes in (1000, 10):
+        monkeypatch.setitem(successive.MIN_LANES, backend, lanes)
+        found.append(radiance(peaked(), 3, walk_branching))
+    assert len(np.unique(found[0][0])) > 90
+    assert np.array_equal(*found)
+
+
+def test_branches_in_a_white_furnace_end_with_the_light_of_the_sky() -> None:
+    """A branch that is left out would darken its ray; half of the rays miss the fog."""
+    fog = box_of(medium("mivol_medium", 3.0, 1.0), PLACE)
+    for origin in ((0.1, 0.2, 0.3), (0.0, -4.0, 0.0)):
+        found = radiance(close_up({"fog": fog, "sky": sky(1.0)}, res=8, origin=origin, target=(1, 1, 1)), 3, walk_branching)
+        np.testing.assert_allclose(found, 1.0, rtol=1e-5)
+
+
+def test_branches_keep_the_alpha() -> None:
+    """A ray of one path and a ray of branches have the same first flight."""
+
+    def whole(estimators: object, sampler: object, ray: mi.Ray3f, _: int) -> tuple:
+        score, alpha = walk_path(estimators, sampler, ray, Primal(dr.zeros(mi.Spectrum, dr.width(ray))))
+        return score.L, alpha
+
+    alone = radiance(peaked(), 1, whole)[3]
+    assert 0 < alone.mean() < 1
+    assert np.array_equal(radiance(peaked(), 2, walk_branching)[3], alone)
+
+
+def count_of(stem: float, branch: float, share: float, events: float, samples: int = 1 << 20) -> int:
+    """Branches chosen for a measured scene."""
+    facts = SimpleNamespace(
+        branch_noise=BranchNoise(stem, branch, share, events),
+        media=(SimpleNamespace(is_scattering=True),),
+        are_samples_independent=True,
+        film_samples=samples,
+    )
+    return choices.choose_image_branches(facts, Settings(max_depth=9), "free_flight")[0]
+
+
+def test_the_number_of_branches_follows_noise_and_time() -> None:
+    """(A + B / k)(1 + r k) with r = share (1 + events) / 2, at most twice the time of k = 1, and a gain of 1.1.
+
+    B = 9 A, r = 0.1: least at k = sqrt(90), so 4, at 1.4 / 1.1 of the time. r = 1: at k = 3, at 4 / 2 of the time. r = 4: k of
+    2 has 9 / 5 of the time and (1 + 4.5) / 10 of the noise, a gain of 1.01. B = A / 9: no k pays.
+    """
+    assert count_of(1.0, 9.0, 0.1, 1.0) == 4
+    assert count_of(1.0, 9.0, 0.5, 3.0) == 3
+    assert count_of(1.0, 9.0, 1.0, 7.0) == 1
+    assert count_of(9.0, 1.0, 0.1, 1.0) == 1
+    assert count_of(0.0, 0.0, 0.1, 1.0) == 1
+    assert count_of(1.0, 9.0, 0.1, 1.0, samples=1 << 15) == 1
+
+
+def test_a_preview_finds_the_noise_behind_collisions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An image of enough samples is measured, and a smaller one is not."""
+    scene = peaked(even=True)
+    assert "paths in images" not in explain(scene, 6)
+    monkeypatch.setattr(choices, "MIN_BRANCHING_SAMPLES", 64)
+    assert "2 branches behind their first collision" in explain(scene, 6)
+
+
+def lit_from_inside() -> dict:
+    """Smoke with a lamp inside, and the sun, over a floor."""
+    down = mi.ScalarTransform4f().translate([0, 0, -1.3]).scale(3)
+    floor = {"type": "rectangle", "to_world": down, "bsdf": {"type": "diffuse"}}
+    lamp = {"type": "point", "position": [0.1, 0.2, 0.1], "intensity": 1.0}
+    return {"matter": smoke(rough_grid(5, 4.0), 0.9)[0], "floor": floor, "lamp": lamp, "sun": sun([0.3, 0.2, -1.0])[0]}
+
+
+def coloured_beside_glass() -> dict:
+    """An rgb extinction beside a refracting ball of fog."""
+    values = np.concatenate([rough_grid(4, 3.0) * k for k in (1, 0.2, 2)], axis=-1)
+    box = box_of(medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.9), PLACE)
+    ball = ball_of(medium("mivol_medium", 1.5, 0.8), (0.3, 1.7, 0.4), 0.5) | {"bsdf": {"type": "dielectric", "int_ior": 1.3}}
+    return {"box": box, "ball": ball, "sky": sky(0.5), "sun": sun([0.3, 0.2, -1.0])[0]}
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+@pytest.mark.parametrize("parts", [lit_from_inside, coloured_beside_glass])
+def test_branches_keep_the_mean(parts: Callable[[], dict], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mean equals the mean of whole paths."""
+    scene, found = close_up(parts(), res=8), []
+    for first, count in ((0, 1), (100, 3)):
+        monkeypatch.setattr(plan, "choose_image_branches", lambda *_, count=count: (count, []))
+        # An integrator keeps its plan.
+        found.append(over_pixels(moments(scene, mivol(max_depth=8), 512, first=first)))
+    whole, branched = found
+    assert_same_mean(branched, whole, rounding=1e-6, what="radiance")
+    assert_precise(difference(branched, whole), 0.03 * whole.mean, what="radiance")

@@ -209,8 +209,7 @@ class _Branching:
         on = number < self.count * self.each
         stem = dr.gather(mi.UInt32, self.collided, number // self.each, on)
         sampler = self.sampler.gather(stem).branch(number % self.each, self.each)
-        branches = _Branches(stem, self.collision.gather(stem, on), sampler)
-        return branches
+        return _Branches(stem, self.collision.gather(stem, on), sampler)
 
 
 @dataclass

@@ -1,12 +1,19 @@
-r"""Successive paths: each lane walks several paths, one after another (path regeneration).
+r"""Successive paths: each lane walks several paths, one after another (path regeneration), or the branches of paths.
+
+.. math:: L = \frac{1}{k} \sum_{j=1}^{k} L_j
 
 A packet of lanes (8 or 16 on a CPU, 32 on a GPU) walks until its longest path ends. If path lengths differ widely, most lanes
-wait: the longest of 16 exponentially distributed lengths is 3.4 times the mean. Here a lane starts its next path as soon as a
-path ends, and waits only after its last path. Sums of 16 such lengths deviate by a quarter of their mean.
+wait: the longest of 16 exponentially distributed lengths is 3.4 times the mean. Here a lane takes the next path of a list as
+soon as its path ends, so no lane waits before the list is empty.
 
-Each path draws its own random numbers, so no path depends on earlier paths of its lane.
+Each path draws its own random numbers, and one lane sums the light of a camera ray. So an image depends neither on the lanes
+of paths nor on the number of threads.
 
-References: Novák et al. 2010 (path regeneration).
+A path may have k branches behind its first collision with a medium. This costs less than k paths if few camera rays collide,
+and lowers the variance as much if most noise comes from behind collisions. :mod:`.derivatives` has the same for derivatives.
+
+References: Novák et al. 2010 (path regeneration); Aila & Laine 2009 (threads that take work from a list); Arvo & Kirk 1990
+(splitting).
 """
 
 from __future__ import annotations
@@ -41,6 +48,9 @@ MIN_LANES = {"llvm": 1 << 13, "cuda": 1 << 20, "metal": 1 << 20}
 """Smallest number of lanes, by backend. On a CPU, Dr.Jit distributes packets of lanes over threads (at least 512 packets here);
 a GPU holds about 2^18 lanes. The number of threads does not enter, so a seed gives the same image on every machine."""
 
+BRANCHED_PATHS = 16
+"""Paths for each lane, of those that may branch."""
+
 
 @dataclass
 class _PathStarts:
@@ -69,25 +79,43 @@ class _PathStarts:
 
 
 def paths_per_lane(limit: int, paths: int) -> int:
-    """Number of successive paths in a lane: at most ``limit``, and fewer if ``paths`` would fill too few lanes."""
+    """Mean number of successive paths in a lane: at most ``limit``, and fewer if ``paths`` would fill too few lanes."""
     backend = mi.variant().split("_")[0]
     return max(1, min(limit, paths // MIN_LANES[backend]))
 
 
-def lanes_of_branches(paths: int) -> int:
-    return max(min(paths, MIN_LANES[mi.variant().split("_")[0]]), paths // 16)
+NONE_YET = 0xFFFFFFFF
+"""Number of the path in a lane that has not begun."""
+
+
+@dataclass
+class _WorkList:
+    """Numbers below a count, which lanes take one after another.
+
+    Attributes:
+        count: how many numbers there are (an array of one number).
+        taken: how many have been asked for (an array of one number).
+    """
+
+    count: mi.UInt32
+    taken: mi.UInt32
+
+    def take(self, asks: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
+        """The next number for each lane that asks, and the lanes for which there was one."""
+        number = dr.scatter_inc(self.taken, dr.zeros(mi.UInt32, dr.width(asks)), asks)
+        return number, asks & (number < self.count)
 
 
 def walk_successively(
     estimators: Estimators, sampler: SpreadSampler, ray: mi.Ray3f, count: int
 ) -> tuple[mi.Spectrum, mi.Float]:
-    """Walk paths from the camera, ``count`` in succession in each lane.
+    """Walk paths from the camera, ``count`` in succession in each lane on average.
 
     Args:
         estimators: estimators of the render.
         sampler: random numbers of each path.
         ray: camera rays in world space with unit directions, one for each path.
-        count: number of paths in a lane.
+        count: number of paths over the number of lanes.
 
     Returns:
         The radiance and the alpha (in [0, 1]) of each path.
@@ -95,16 +123,13 @@ def walk_successively(
     Bias, variance: as for :func:`mivol.transport.path.walk.walk_path`. Memory: 16 numbers a path, 34 with tabulated shadows.
     """
     n = dr.width(ray)
-    lanes = -(-n // count)
-    taken, number = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, n)
+    lanes, paths = -(-n // count), _WorkList(dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, 0))
     clipped, medium, sampler = clip_camera_ray(ray), estimators.media.medium_at(ray), sampler.clone()
     known = estimators.segment.find_first_collision(clipped, medium, sampler, dr.full(mi.Bool, True, n))
     starts = _PathStarts(clipped, medium, sampler, known)
     L, alpha = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Float, n)
     kept = KeptShadow.empty(n) if estimators.tabulates_shadows else None
     dr.eval(starts, L, alpha, kept)
-    zero = dr.zeros(mi.UInt32, lanes)
-    nowhere = dr.full(mi.Bool, False, lanes)
 
     def start(index: mi.UInt32, active: mi.Bool) -> Path:
         ray, medium, sampler, known = starts.gather(index, active)
@@ -112,25 +137,21 @@ def walk_successively(
         path.known = known
         return leave_camera(estimators, path, medium)
 
-    def advance(path: Path, index: mi.UInt32, walks: mi.Bool) -> tuple[Path, mi.UInt32, mi.Bool]:
+    def advance(path: Path, index: mi.UInt32, on: mi.Bool) -> tuple[Path, mi.UInt32, mi.Bool]:
         path = advance_path(estimators, path)
-        ended = ~path.active
-        done = ended & (index < number)
-        dr.scatter(L, path.score.L, index, done)
-        dr.scatter(alpha, film_alpha(path), index, done)
+        asks = on & ~path.active
+        ended = asks & (index != NONE_YET)
+        dr.scatter(L, path.score.L, index, ended)
+        dr.scatter(alpha, film_alpha(path), index, ended)
         if kept is not None:
-            kept.scatter(path.tabulated, index, done)
-        index = dr.select(ended, dr.scatter_inc(taken, zero, ended), index)
-        walks = index < number
-        return dr.select(ended, start(index, ended & walks), path), index, walks
+            kept.scatter(path.tabulated, index, ended)
+        following, begins = paths.take(asks)
+        index = dr.select(asks, following, index)
+        return dr.select(asks, start(index, begins), path), index, path.active | begins
 
-    index = dr.full(mi.UInt32, 0xFFFFFFFF, lanes)
-    dr.while_loop(
-        state=(start(index, nowhere), index, ~nowhere),
-        cond=lambda path, index, walks: walks,
-        body=advance,
-        label="successive paths",
-    )
+    # No lane has begun: the first turn of the loop gives each its first path, until the list is empty.
+    index, on = dr.full(mi.UInt32, NONE_YET, lanes), dr.full(mi.Bool, True, lanes)
+    dr.while_loop(state=(start(index, ~on), index, on), cond=lambda *state: state[-1], body=advance, label="successive paths")
     dr.eval(L, alpha, kept)
     if kept is not None:
         # Here every lane has one shadow ray, and none waits for the longer path of another.
@@ -143,8 +164,6 @@ def walk_branching(
 ) -> tuple[mi.Spectrum, mi.Float, mi.UInt32]:
     """Walk paths from the camera that branch at their first collision with a medium.
 
-    A lane walks all branches of a stem in succession, so the sum of their light does not depend on the threads.
-
     Args:
         estimators: estimators of the render; their segments end in media.
         sampler: random numbers of each path.
@@ -152,62 +171,53 @@ def walk_branching(
         count: number of branches of a path.
 
     Returns:
-        The radiance, the alpha (in [0, 1]), and the number of scattering events of the last branch (0 without a collision) of
-        each path.
+        The radiance, the alpha (in [0, 1]) and the number of scattering events of each path, by its last branch; 0 events
+        without a collision.
 
     Bias: none. Variance: A + B / count, with the variance A of stems and B of a branch. Memory: 40 numbers a path, 58 with
     tabulated shadows.
     """
     n, first = dr.width(ray), sampler.clone()
     stems, collision, alpha = walk_stem(estimators, sampler, ray, Primal(dr.zeros(mi.Spectrum, n)))
-    number, taken, collided = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 0), dr.zeros(mi.UInt32, n)
-    dr.scatter(collided, dr.arange(mi.UInt32, n), dr.scatter_inc(number, mi.UInt32(0), collision.on), collision.on)
-    L, depth = dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n)
+    collided, found = dr.zeros(mi.UInt32, n), _WorkList(dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, 0))
+    dr.scatter(collided, dr.arange(mi.UInt32, n), *found.take(collision.on))
+    L, events = dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n)
     kept = KeptShadow.empty(n) if estimators.tabulates_shadows else None
-    dr.eval(stems.L, alpha, collision, first, number, collided, L, depth, kept)
-    # -- The branches: each lane has some stems ----------------------------------------------------------------------------
-    lanes = lanes_of_branches(n)
-    each = dr.opaque(mi.UInt32, count)
-    zero = dr.zeros(mi.UInt32, lanes)
+    dr.eval(stems.L, alpha, collision, first, found.taken, collided, L, events, kept)
+    lanes, each = -(-n // paths_per_lane(BRANCHED_PATHS, n)), dr.opaque(mi.UInt32, count)
+    todo = _WorkList(found.taken, dr.opaque(mi.UInt32, 0))
 
-    def take(branch: mi.UInt32, stem: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32, mi.Bool]:
-        """The next branch of the stem of each lane, or the first of the next stem."""
-        branch = branch + 1
-        done = active & (branch == each)
-        place = dr.scatter_inc(taken, zero, done)
-        stem = dr.select(done, dr.gather(mi.UInt32, collided, place, done & (place < number)), stem)
-        return dr.select(done, 0, branch), stem, active & (~done | (place < number))
+    def start(stem: mi.UInt32, branch: mi.UInt32, active: mi.Bool, score: Primal) -> tuple[Path, KnownFlight]:
+        at, numbers = collision.gather(stem, active), first.gather(stem, active).branch(branch, each)
+        return start_branch(estimators, numbers, at, score), KnownFlight(at.t, at.body, active)
 
-    def start(branch: mi.UInt32, stem: mi.UInt32, active: mi.Bool, score: Primal) -> tuple[Path, KnownFlight]:
-        at = collision.gather(stem, active)
-        path = start_branch(estimators, first.gather(stem, active).branch(branch, each), at, score)
-        return path, KnownFlight(at.t, at.body, active)
-
-    def advance(path: Path, begun: KnownFlight, branch: mi.UInt32, stem: mi.UInt32, walks: mi.Bool) -> tuple:
-        path = advance_branch(estimators, path, begun)
-        ended, last = ~path.active, branch + 1 == each
-        done = ended & last & (stem < n)
-        dr.scatter(L, path.score.L, stem, done)
-        dr.scatter(depth, path.depth, stem, done)
+    def advance(path: Path, begun: KnownFlight, stem: mi.UInt32, branch: mi.UInt32, on: mi.Bool) -> tuple:
+        path, begun = advance_branch(estimators, path, begun), begun.forget()
+        # -- The light of all branches of a stem -------------------------------------------------------------------------
+        next_one = on & ~path.active
+        asks = next_one & (branch + 1 == each)
+        ended = asks & (stem != NONE_YET)
+        dr.scatter(L, path.score.L, stem, ended)
+        dr.scatter(events, path.depth, stem, ended)
         if kept is not None:
-            kept.scatter(path.tabulated, stem, done)
-        next_branch, next_stem, active = take(branch, stem, ended)
-        again, fresh = start(next_branch, next_stem, active, Primal(dr.select(last, 0, path.score.L)))
+            kept.scatter(path.tabulated, stem, ended)
+        # -- The next branch ---------------------------------------------------------------------------------------------
+        place, begins = todo.take(asks)
+        stem = dr.select(asks, dr.gather(mi.UInt32, collided, place, begins), stem)
+        branch = dr.select(asks, 0, dr.select(next_one, branch + 1, branch))
+        begins |= next_one & ~asks
+        fresh, at_collision = start(stem, branch, begins, Primal(dr.select(asks, 0, path.score.L)))
         if kept is not None:
-            again.tabulated = dr.select(last, again.tabulated, path.tabulated)
-        branch, stem = dr.select(ended, next_branch, branch), dr.select(ended, next_stem, stem)
-        walks = active | ~ended
-        return dr.select(ended, again, path), dr.select(ended, fresh, begun.forget()), branch, stem, walks
+            fresh.tabulated = dr.select(asks, fresh.tabulated, path.tabulated)
+        on = path.active | begins
+        return dr.select(next_one, fresh, path), dr.select(next_one, at_collision, begun), stem, branch, on
 
-    nowhere, stem = dr.full(mi.Bool, False, lanes), dr.full(mi.UInt32, 0xFFFFFFFF, lanes)
-    path, begun = start(zero, stem, nowhere, Primal(dr.zeros(mi.Spectrum, lanes)))
-    dr.while_loop(
-        state=(path, begun, mi.UInt32(each - 1) + zero, stem, ~nowhere),
-        cond=lambda *state: state[-1],
-        body=advance,
-        label="branches",
-    )
-    dr.eval(L, depth, kept)
+    # As if all lanes had ended their last branch: the first turn of the loop gives each its first stem.
+    stem, on = dr.full(mi.UInt32, NONE_YET, lanes), dr.full(mi.Bool, True, lanes)
+    branch = dr.zeros(mi.UInt32, lanes) + (each - 1)
+    path, begun = start(stem, branch, ~on, Primal(dr.zeros(mi.Spectrum, lanes)))
+    dr.while_loop(state=(path, begun, stem, branch, on), cond=lambda *state: state[-1], body=advance, label="branches")
+    dr.eval(L, events, kept)
     if kept is not None:
         L += kept.light_at_camera(estimators.media, ray)
-    return stems.L + L * dr.rcp(mi.Float(each)), alpha, depth
+    return stems.L + L * dr.rcp(mi.Float(each)), alpha, events
