@@ -83,11 +83,11 @@ def test_a_plan_takes_them_where_lengths_differ(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(successive.MIN_LANES, mi.variant().split("_")[0], 64)
     walk = walk_successively
     monkeypatch.setattr("mivol.scene.render_tasks.walk_successively", lambda *args: counts.append(args[-1]) or walk(*args))
-    for depth in (-1, 17, 16):
+    for depth in (-1, 5, 4):
         mi.render(scene, integrator=mi.load_dict(mivol(max_depth=depth)), spp=8)
     assert counts == [8, 8]  # 512 paths
     assert "up to 16 paths one after the other" in explain(scene, -1)
-    assert "lanes" not in explain(scene, 16)
+    assert "lanes" not in explain(scene, 4)
     facts = find_needs(scene, scene.sensors()[0])
     assert make_plan(facts, Settings(max_depth=-1)).successive_paths == 16
     assert make_plan(replace(facts, are_samples_independent=False), Settings(max_depth=-1)).successive_paths == 1
