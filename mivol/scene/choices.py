@@ -359,9 +359,9 @@ def choose_image_branches(needs: Needs, settings: Settings, segment: str) -> tup
 
     With k branches at r times the time of a stem each, variance x time is (A + B / k)(1 + r k).
     """
-    noise = needs.branch_noise
-    if noise is None or not is_branch_noise_open(needs, settings, segment):
+    if not is_branch_noise_open(needs, settings, segment) or needs.branch_noise is None:
         return 1, []
+    noise = needs.branch_noise
     r = noise.share * (BRANCH_COST + EVENT_COST * noise.events)
     counts = [k for k in range(1, MAX_IMAGE_BRANCHES + 1) if 1 + r * k <= MAX_BRANCHING_TIME * (1 + r)]
     work = {k: (noise.stem + noise.branch / k) * (1 + r * k) for k in counts}
