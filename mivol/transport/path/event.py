@@ -61,10 +61,10 @@ class PathEvent:
         return cls(si, t, collision.mei.medium, nowhere, collision, chance)
 
     def begin_at(self, collision: Collision) -> PathEvent:
-        """The events, with those of paths beginning at collisions in the lanes of these."""
+        """These events, and in the lanes of a collision, whose paths have not moved, the event of a path beginning there."""
         on = collision.on
         merged = {f.name: dr.select(on, getattr(collision, f.name), getattr(self.collision, f.name)) for f in fields(Collision)}
-        return PathEvent(self.si, self.t, self.medium, self.at_surface & ~on, Collision(**merged), self.chance)
+        return PathEvent(self.si, self.t, self.medium, self.at_surface, Collision(**merged), self.chance)
 
     def vertex(self, media: SceneMedia) -> Vertex:
         """The point at which light is scattered."""

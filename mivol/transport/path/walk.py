@@ -358,11 +358,11 @@ def advance_path(estimators: Estimators, path: Path) -> Path:
 
 def advance_branch(estimators: Estimators, path: Path, start: KnownFlight) -> Path:
     """Advance a path; lanes of ``start`` are at a collision on the segment already, and scatter there."""
-    beta, active = mi.Spectrum(path.beta), path.active
+    active = path.active
     path.active = active & ~start.on
     path, event = _follow_segment(estimators, path)
     path = _add_emitted_light(estimators, path, event)
-    path.active, path.beta = active, dr.select(start.on, beta, path.beta)
+    path.active = active
     hit = make_collision(estimators.media, path.ray, start.t, start.body, active & start.on)
     return _scatter(estimators, path, event.begin_at(hit))
 
