@@ -26,6 +26,9 @@ path hits a light found by sampling, the difference of the means stands for the 
 drawn on each segment. The gain is the sum of the variances of all cells with collisions, over c times their sum with distances:
 the noise of collisions near an emitter is large in few cells.
 
+**Branches.** :func:`measure_branch_noise` measures the variance of pixels with one and with several branches of a path. With k
+branches it is A + B / k, so two numbers of branches tell the noise A of stems and B of branches.
+
 **Noise of lights.** :func:`measure_emitter_noise` renders single pixels with and without each emitter, for ``mivol explain``.
 """
 
@@ -332,7 +335,7 @@ def measure_branch_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, surve
     Arguments as for :func:`measure_media_light`; ``survey`` keeps the variances of each sensor.
 
     Returns:
-        The needs with the variances. With k branches the variance is A + B / k, so two numbers of branches tell A and B.
+        The needs with the variances.
 
     Cost: 65536 camera rays once, and 5 paths for each that collides.
     """
