@@ -200,6 +200,9 @@ class OctreeFit(FieldFit):
     def gains(self) -> None:
         return None
 
+    def motions(self) -> None:
+        return None
+
 
 def count_parts(field: AnyField) -> str:
     """Leaves, nodes or numbers of a field, with the word."""

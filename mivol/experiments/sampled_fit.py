@@ -64,6 +64,9 @@ class SampledFit(FieldFit):
     def gains(self) -> None:
         return None
 
+    def motions(self) -> None:
+        return None
+
 
 def make_sampled_batches(photos: Photos) -> RayBatches:
     """The photographs in full size, undistorted if their lens has an image plane."""

@@ -9,6 +9,8 @@ import pytest
 
 from mivol.errors import MivolError
 from mivol.experiments import sampled_fit
+from mivol.experiments.field_fit import FieldFit
+from mivol.experiments.octree_fit import OctreeFit
 from mivol.optim.photographs.sampled_problem import PRESETS
 from mivol.photos import Camera, intrinsics
 
@@ -78,3 +80,11 @@ def test_a_plan_in_words(kind: str, changes: dict, expected: dict) -> None:
     assert own.startswith("about ") and "photographs 3, the fit " in own
     marked = sampled_fit.explain_sampled_plan(plan, photographs(np.ones((4, 4))), SimpleNamespace(bytes=0))
     assert {line.choice: line.reason for line in marked}["no field behind the box"] == "alpha marks the object"
+
+
+@pytest.mark.parametrize("kind", [sampled_fit.SampledFit, OctreeFit])
+def test_exposures_and_cameras_stay(kind: type[FieldFit]) -> None:
+    """Problems of these kinds have neither gains nor poses, for which the outputs of a run ask every kind."""
+    fit = object.__new__(kind)
+    fit.problem = SimpleNamespace()
+    assert fit.gains() is None and fit.motions() is None
