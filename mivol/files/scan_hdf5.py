@@ -424,10 +424,12 @@ def _read_angles(path: Path, part: Frames | None, unit: str | None) -> tuple[np.
         raise refusal(path, f"{part.name} in {called!r}", "degrees or radians", way_out)
     if unit is not None:
         return angles * ANGLES[unit], ()
-    if ANGLES[said] != 1 and (turns := half_turns_in_radians(angles)):
-        return angles, (
+    other, unit_of = ("radian", 1.0) if ANGLES[said] != 1 else ("degree", np.pi / 180)
+    if turns := half_turns_in_radians(angles * unit_of):
+        own = "degree" if other == "radian" else "radian"
+        return angles * unit_of, (
             f"the angles {'are called ' + called if called else 'have no unit'} and span {np.ptp(angles):.4f}, {turns} in "
-            'radians: they are taken as radians; data.angle_unit = "degree" takes them as degrees',
+            f'{other}s: they are taken as {other}s; data.angle_unit = "{own}" takes them as {own}s',
         )
     return angles * ANGLES[said], ()
 

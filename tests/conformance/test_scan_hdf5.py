@@ -72,7 +72,7 @@ def test_datasets_by_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("arc", "turns"), [(np.pi, "half a turn"), (2 * np.pi, "a turn")])
-def test_radians_called_degrees_are_seen_by_the_arc(tmp_path: Path, arc: float, turns: str) -> None:
+def test_wrong_units_of_angles_are_seen_by_the_arc(tmp_path: Path, arc: float, turns: str) -> None:
     """With the last view at the end of the arc or a step before, to a hundredth; a setting decides otherwise."""
     angles = np.linspace(0, arc, 40)
     assert half_turns_in_radians(angles) == half_turns_in_radians(angles[:-1]) == turns
@@ -86,6 +86,13 @@ def test_radians_called_degrees_are_seen_by_the_arc(tmp_path: Path, arc: float, 
     np.testing.assert_array_equal(scan.angles, angles)
     assert scan.notes[0].startswith(f"the angles are called degrees and span {arc:.4f}, {turns} in radians: they are taken as")
     np.testing.assert_allclose(read_projections(path, names=names, angle_unit="degree").angles, np.radians(angles))
+    with h5py.File(path, "a") as file:
+        file["t"][...] = np.degrees(angles)
+        file["t"].attrs["units"] = "rad"
+    scan = read_projections(path, names=names)
+    np.testing.assert_allclose(scan.angles, angles)
+    assert f"{turns} in degrees: they are taken as degrees" in scan.notes[0]
+    np.testing.assert_array_equal(read_projections(path, names=names, angle_unit="radian").angles, np.degrees(angles))
 
 
 def change(path: Path, name: str, value: object) -> None:
