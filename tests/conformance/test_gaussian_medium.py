@@ -239,6 +239,7 @@ def test_the_derivative_by_the_place_of_a_lamp_is_refused() -> None:
 
 def test_gaussians_are_a_sigma_t_and_nothing_else() -> None:
     gaussians = volume(cloud(2))
+    assert mi.load_dict(gaussians).channel_count() == 1
     for wrong in ({"sigma_t": 1.0, "albedo": gaussians}, {"sigma_a": 0.1, "sigma_s": gaussians}):
         with pytest.raises((MivolError, RuntimeError), match="a mivol_gaussians as .*; give it as sigma_t, with an albedo"):
             mi.load_dict({"type": "mivol_medium", **wrong})
