@@ -6,7 +6,8 @@
 A request is a camera that a page has not asked for before. The coarse picture answers it; the full picture follows when the
 camera rests. Subjects are made on the spot: random Gaussians in a ball, a grid with harmonics of degree 2 around the surface of
 a ball, and a volume of values. Kernels are warm, as after the start of ``mivol view``. Times are medians over rounds, in
-processor time of all threads and in time of the clock; on two idle cores the first is about twice the second.
+processor time of all threads and in time of the clock; on two idle cores the first is about twice the second. Under load the
+painter makes the coarse picture smaller; the processor time of a picture of the whole edge does not depend on the load.
 
 ``cost`` repeats a fit of the example demo, alone and with a viewer in turn. The viewer is a process that asks for a new camera
 after each picture, more often than a person does. Its times are the clock during the steps of the fit, which needs a machine
@@ -74,7 +75,7 @@ def write_subject(path: Path, size: ViewerSize) -> Path:
 
 
 def measure_pictures(name: str, size: ViewerSize) -> dict:
-    """Median times of the coarse picture, and its size."""
+    """Median times of the coarse picture, and its size; ``whole`` is the processor time of a picture of ``edge`` pixels."""
     with TemporaryDirectory() as folder:
         subject = open_subject(write_subject(Path(folder) / name, size))
     sent: list[np.ndarray] = []
@@ -93,8 +94,13 @@ def measure_pictures(name: str, size: ViewerSize) -> dict:
         clock.append(time.perf_counter() - start[0])
         processor.append(time.process_time() - start[1])
     height, width = sent[-1].shape[:2]
+    whole = []
+    for camera in cameras[1:]:
+        start = time.process_time()
+        subject.draw(camera, painter.look)
+        whole.append(time.process_time() - start)
     return {"name": name, "width": width, "height": height, "clock": float(np.median(clock[1:])),
-            "processor": float(np.median(processor[1:]))}  # fmt: skip
+            "processor": float(np.median(processor[1:])), "whole": float(np.median(whole[1:]))}  # fmt: skip
 
 
 # -- Cost of a viewer ----------------------------------------------------------------------------------------------------------
@@ -165,7 +171,8 @@ def table(question: str, answer: dict) -> list[str]:
             f"processor time; {answer['pictures']} pictures in {len(answer['rows']['alone'])} fits"
         ]
     times = f"{1000 * answer['clock']:.0f} ms of the clock, {1000 * answer['processor']:.0f} ms of the processor"
-    return [f"{answer['name']}: {answer['width']} x {answer['height']} pixels in {times}"]
+    whole = f"{1000 * answer['whole']:.0f} ms of the processor for the longest edge asked for"
+    return [f"{answer['name']}: {answer['width']} x {answer['height']} pixels in {times}; {whole}"]
 
 
 def _question(name: str) -> Callable[[ViewerSize], dict]:
