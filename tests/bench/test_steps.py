@@ -94,6 +94,14 @@ def test_first_steps_are_timed_in_processes_of_their_own(monkeypatch: pytest.Mon
         study.measure_first(study.StepsSize(loop_scenes=("jade_null_sun",)))
 
 
+def test_the_chair_is_left_out_without_its_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study, "find_photographs", lambda name, size: None)
+    answer = study.measure_chair(study.StepsSize())
+    assert answer == {"rows": {}} and study.compare("chair", answer) == [] and len(study.table("chair", answer)) == 2
+    slow = {"rows": {"the chair": {"milliseconds": {"mivol": 51.0}}}}
+    assert [bar["met"] for bar in study.compare("chair", slow)] == [False]
+
+
 def test_a_scene_that_is_misspelt_is_named() -> None:
     with pytest.raises(MivolError, match='there is no scene "jade_null_sum": .*jade_null_sun'):
         study.measure_steps(False, study.StepsSize(scenes=("jade_null_sum",)))
