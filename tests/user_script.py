@@ -43,6 +43,7 @@ angles = np.linspace(0, np.pi, 60, endpoint=False)
 grid = mivol.VoxelGrid((1, 64, 64), 1 / 32)
 for geometry in (mivol.ParallelBeam(angles, (1, 64)), mivol.ConeBeam(angles, (1, 64), 500, 1000)):
     projector = mivol.Projector(geometry, grid)
+    columns: np.ndarray = mivol.run_algotom("find_center_vo", np.ones((64, 1, 64)), angles, step=0.1)
     back = projector.T @ (projector @ np.zeros(grid.shape, np.float32))
 
 cloud: mivol.PointCloud = mivol.read_points("points.ply")

@@ -29,7 +29,9 @@ AXIS_ROWS, HALF_TURNS = 5, 5
 """Most rows, and half turns of a longer scan, in which an axis is looked for."""
 
 
-def run_algotom(method: str, y: np.ndarray, angles: np.ndarray | None = None, **options: Any) -> np.ndarray:
+def run_algotom(
+    method: str, y: np.ndarray, angles: np.ndarray | None = None, **options: float | str | bool | np.ndarray | None
+) -> np.ndarray:
     """Apply a method of algotom to projections.
 
     * ``remove_all_stripe``, ``remove_dead_stripe``, ``remove_large_stripe``, ``remove_stripe_based_...``: each row's sinogram;
