@@ -73,11 +73,12 @@ def choose_integrator(scene: mi.Scene, name: str | None = None) -> mi.Integrator
         if scene.integrator() is None:
             raise MivolError("the scene has no integrator: add an integrator to the scene, or choose --integrator mivol.")
         return scene.integrator()
+    light = describe_light(scene)
     try:
-        return mi.load_dict({"type": name, **describe_light(scene)})
+        return mi.load_dict({"type": name, **light})
     except RuntimeError as error:
         if "max_depth" in str(error):
-            return mi.load_dict({"type": name})
+            return mi.load_dict({"type": name, "hide_emitters": light["hide_emitters"]})
         raise MivolError(f'the integrator "{name}" cannot be loaded ({describe_error(error)}): choose "mivol".') from None
 
 

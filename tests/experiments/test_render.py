@@ -73,3 +73,10 @@ def test_a_volume_without_matter_is_refused(variant_rgb, tmp_path: Path) -> None
     (tmp_path / "broken.vol").write_bytes(b"VOL\3")
     with refused("^[^ ]*broken.vol"):
         render.render_volume(tmp_path / "broken.vol", Framing())
+
+
+@pytest.mark.parametrize("name", ["volpath", "direct"])
+def test_a_named_integrator_hides_what_the_scene_hides(variant_rgb, name: str) -> None:
+    """``direct`` has no longest path, and hides emitters all the same."""
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "volpath", "max_depth": 5, "hide_emitters": True}})
+    assert render.choose_integrator(scene, name).hide_emitters
