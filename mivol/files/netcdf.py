@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.files.hdf5 import check_storage, is_hdf5, opened, to_text
+from mivol.files.hdf5 import MAGIC, check_storage, is_hdf5, opened, to_text
 from mivol.files.npy import check_memory
 from mivol.files.renderer_grids import UNEVEN, water_extinction
 from mivol.files.source import refusal, select_dataset
@@ -80,7 +80,7 @@ class Variable:
 
 def is_netcdf(head: bytes) -> bool:
     """Whether a file begins as a kind of NetCDF does; NetCDF-4 begins as HDF5."""
-    return head.startswith((CLASSIC, OFFSETS, WIDE, b"\x89HDF\r\n\x1a\n"))
+    return head.startswith((CLASSIC, OFFSETS, WIDE, MAGIC))
 
 
 def read_netcdf(path: Path, dataset: str | None = None) -> VolumeData:
@@ -114,9 +114,8 @@ def read_netcdf(path: Path, dataset: str | None = None) -> VolumeData:
     stored, rest = str(array.dtype), sorted(axes.values())
     array = np.transpose(array, [rest.index(axes[axis]) for axis in "zyx"])
     array, to_world, notes = _place(path, array, place, notes, "km" if has_water else "m")
-    found = name + (f"[{','.join(str(i) for i in index if isinstance(i, int))}]" if dataset and "[" in dataset else "")
     meta = {
-        "path": str(path), "format": "netcdf", "dtype": stored, "space": None, "dataset": found,
+        "path": str(path), "format": "netcdf", "dtype": stored, "space": None, "dataset": dataset or name,
         "unit": "m" if place[0] is not None else "voxel", "notes": tuple(notes),
     }  # fmt: skip
     return VolumeData(to_values(array, path), to_world, meta)

@@ -75,6 +75,15 @@ class Event(Strategy, tag="event"):
         raise NotImplementedError
 
 
+class RegularEvent(Event, tag="regular_event"):
+    """An event before each iteration whose number is a multiple of ``every``, the first iteration excepted."""
+
+    every: Annotated[int, setting("iteration", "interval between events", ge=1)]
+
+    def due(self, iteration: int) -> bool:
+        return iteration > 0 and iteration % self.every == 0
+
+
 def check_for_grids(count: int) -> None:
     """Check for a grid among the parameters.
 
@@ -163,13 +172,10 @@ class AdaptBricks(Event, tag="adapt_bricks"):
         return refinement.message
 
 
-class UpdateOccupancy(Event, tag="update_occupancy"):
+class UpdateOccupancy(RegularEvent, tag="update_occupancy"):
     """Let a problem update the list of cells that steps can skip without changing their result."""
 
     every: Annotated[int, setting("iteration", "interval between events", ge=1)] = 64
-
-    def due(self, iteration: int) -> bool:
-        return iteration > 0 and iteration % self.every == 0
 
     def apply(self, fit: RunningFit) -> str:
         fit.problem.set_reals(fit.run.reals)
@@ -177,13 +183,10 @@ class UpdateOccupancy(Event, tag="update_occupancy"):
         return ""
 
 
-class AlignCameras(Event, tag="align_cameras"):
+class AlignCameras(RegularEvent, tag="align_cameras"):
     """Let a problem move the cameras of its photographs to where its model agrees better with them."""
 
     every: Annotated[int, setting("iteration", "interval between events", ge=1)] = 25
-
-    def due(self, iteration: int) -> bool:
-        return iteration > 0 and iteration % self.every == 0
 
     def apply(self, fit: RunningFit) -> str:
         fit.problem.set_reals(fit.run.reals)
@@ -207,13 +210,10 @@ class ControlDensity(Event, tag="control_density"):
         return refinement.message
 
 
-class Checkpoint(Event, tag="checkpoint"):
+class Checkpoint(RegularEvent, tag="checkpoint"):
     """Write all inputs of the next iteration."""
 
     every: Annotated[int, setting("iteration", "interval between events", ge=1)] = 10
-
-    def due(self, iteration: int) -> bool:
-        return iteration > 0 and iteration % self.every == 0
 
     def apply(self, fit: RunningFit) -> str:
         fit.save()
