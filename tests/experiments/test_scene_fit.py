@@ -25,6 +25,7 @@ from mivol.experiments import scene_fit
 from mivol.experiments.scene_fit import SceneOutputs
 from mivol.experiments.start import make_start
 from mivol.files import atomic, read_exr, read_volume, write_exr
+from mivol.optim.loop import MAX_UNREAD
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import FINAL, derive_seed
 
@@ -201,8 +202,9 @@ def test_interrupted_run_is_resumed(variant_rgb, folder: Path) -> None:
     assert child.returncode == 130
     assert "mivol: stopped" in child.stderr
     assert "Traceback" not in child.stderr
-    # It stops at the next safe point, in iteration 3 or before the one after.
-    assert (folder / "cut" / "metrics.jsonl").read_text().count("\n") in (3, 4)
+    # Rows are written in groups of up to MAX_UNREAD: the one of iteration 2 may be the first of its group. It stops at the next
+    # safe point, so at most one more iteration runs.
+    assert 3 <= (folder / "cut" / "metrics.jsonl").read_text().count("\n") <= 2 + MAX_UNREAD + 1
     assert json.loads((folder / "cut" / "run.json").read_text())["status"] == "stopped"
     assert run("optimize", folder / "fit.toml", "-o", folder / "cut", *long, "--resume") == 0
     texts = [(folder / name / "metrics.jsonl").read_text() for name in ("whole", "cut")]
