@@ -14,9 +14,9 @@ Limits. An opacity above ``MAX_OPACITY`` counts as ``MAX_OPACITY`` (1 would be a
 ``MIN_RELATIVE_SCALE`` of the box counts as this scale (float32 resolves no smaller distance). Clipped values have derivative 0.
 
 Cells. A ray reads only the lists of the cells along its path. The box of the cells lies along the world axes and holds every
-Gaussian up to ``REACH`` standard deviations. Its lattice has (Z, Y, X) nodes at voxel centres. Along each axis a cell lies
-between two nodes, or between a node and a face of the box; cells are numbered from 0 to N, x fastest. A list holds each
-Gaussian whose ellipsoid touches the cell, and may hold more.
+Gaussian up to ``REACH`` standard deviations. Planes across each axis divide it into cells, with equal numbers of means between
+neighbouring planes: a fit of photographs has most Gaussians in a hundredth of the box, and others as far as the sky. Cells are
+numbered with x fastest. A list holds each Gaussian whose ellipsoid touches the cell, and may hold more.
 """
 
 from __future__ import annotations
@@ -68,6 +68,7 @@ class GaussianField:
     Attributes:
         lists: Gaussians of each cell.
         starts, entries: the lists as device arrays.
+        grid: the planes between the cells.
         flat: rows of the Gaussians, detached, for a scale of 1.
     """
 
@@ -127,9 +128,7 @@ class GaussianField:
         self._bound = self.lists.max_cell_sum(depth * largest) / math.sqrt(2 * math.pi)
         self.starts, self.entries = mi.UInt32(self.lists.starts), mi.UInt32(self.lists.entries)
         # Mitsuba evaluates media inside traced loops, in which no array can be prepared.
-        edge, nodes = np.diag(self.to_world)[:3], self.lists.res[::-1]
-        self._low = [dr.opaque(mi.Float, float(x)) for x in self.to_world[:3, 3]]
-        self._pace = [dr.opaque(mi.Float, float(n / x)) for n, x in zip(nodes, edge, strict=True)]
+        self.grid = PlaneGrid.from_planes(self.lists.planes)
         with dr.suspend_grad():
             self.flat = dr.detach(self.rows(mi.Float(1)))
         dr.eval(self.flat)
@@ -191,12 +190,8 @@ class GaussianField:
 
     def visit_at_points(self, ray: mi.Ray3f, active: mi.Bool, state: Any, add: Callable[..., Any]) -> Any:
         """Visit the Gaussians that may contain the origins of rays: ``add(state, line, index) -> state``."""
-        cell, inside = [], mi.Bool(active)
-        for x, low, pace, n in zip(mi.Point3f(ray.o), self._low, self._pace, self.lists.res[::-1], strict=True):
-            u = (x - low) * pace
-            inside &= (u >= 0) & (u <= n)
-            cell.append(dr.clip(mi.Int32(dr.floor(u + 0.5)), 0, n))
-        return self.visit_cell(mi.Vector3i(*cell), (ray.o, ray.d), inside, state, add)
+        cell, inside = self.grid.find_cell(ray.o)
+        return self.visit_cell(cell, (ray.o, ray.d), inside & active, state, add)
 
     def visit_cell(
         self, cell: mi.Vector3i, through: tuple[mi.Point3f, mi.Vector3f], on: mi.Bool, state: Any, add: Callable[..., Any]
@@ -204,13 +199,13 @@ class GaussianField:
         """Visit the Gaussians of a cell: ``add(state, line, index) -> state``.
 
         Args:
-            cell: cell of each lane, indices from 0 to N along each axis.
+            cell: cell of each lane.
             through: a point and the direction of the line.
             on: lanes that visit.
             state: any PyTree of Dr.Jit arrays.
             add: function traced once in the loop; ``line.hits`` marks the lanes that count.
         """
-        _, y, x = (n + 1 for n in self.lists.res)
+        x, y, _ = self.grid.counts
         number = mi.UInt32((cell.z * y + cell.y) * x + cell.x)
         start, end = (dr.gather(mi.UInt32, self.starts, number + k, on) for k in (0, 1))
         entries, rows = self.entries, self.flat
@@ -266,14 +261,26 @@ CELLS_PER_GAUSSIAN = 1.0
 """Cells for each Gaussian: 22^3 cells for 10,000 Gaussians. On a dense cloud of this size line integrals take the same time
 (within 10 %) from 0.4 to 8 cells a Gaussian; with 8 the lists take four times as long to make."""
 
+MAX_REACHED = 64.0
+"""Mean number of cells that the boxes around the Gaussians may reach into: more cells make the lists long."""
+
 MIN_CELLS, MAX_CELLS = 8, 1 << 21
 """Limits of the number of cells."""
 
-MAX_NODES = 256
-"""Limit along an axis."""
+MAX_COUNT = 256
+"""Largest number of cells along an axis."""
+
+STEPS = 1 << 16
+"""Places of planes along an axis: no cell is thinner than the box divided by this number."""
+
+INNER = (0.05, 0.95)
+"""Quantiles of the means between which the cells are nearly cubic."""
 
 SLACK = 1e-3
 """Enlargement of the box and of each cell, in edges; float32 rounding of a ray's position must not lose a Gaussian."""
+
+ROUNDING = 2e-6
+"""Enlargement of each cell besides, relative to the largest coordinate: 16 roundings of a position in float32."""
 
 PAIR_BYTES = 120
 """Memory of one pair of cell and Gaussian during the touch test [bytes]."""
@@ -287,21 +294,61 @@ class CellLists:
     """The Gaussians of each cell.
 
     Attributes:
-        to_world: (4, 4) float64, unit cube to box.
-        res: nodes (Z, Y, X); each axis has one cell more.
+        planes: places of the planes across x, y and z [length], increasing, float64 numbers that float32 holds; the first and
+            the last of an axis are faces of the box.
         starts: (cells + 1,) uint32; cell c owns the entries from ``starts[c]`` to ``starts[c + 1]``.
         entries: (n,) uint32, numbers of Gaussians.
     """
 
-    to_world: np.ndarray
-    res: tuple[int, int, int]
+    planes: list[np.ndarray]
     starts: np.ndarray
     entries: np.ndarray
+
+    @property
+    def to_world(self) -> np.ndarray:
+        """(4, 4) float64, unit cube to box."""
+        to_world = np.diag([*(axis[-1] - axis[0] for axis in self.planes), 1.0])
+        to_world[:3, 3] = [axis[0] for axis in self.planes]
+        return to_world
 
     def max_cell_sum(self, values: np.ndarray) -> float:
         """The largest sum over the entries of a cell of ``values`` (N,), one number a Gaussian."""
         sums = np.concatenate([[0.0], np.cumsum(values[self.entries], dtype=np.float64)])
         return float(np.diff(sums[self.starts]).max(initial=0.0))
+
+
+@dataclass
+class PlaneGrid:
+    """The planes between cells as device arrays, the same for kernels of any number of planes.
+
+    Attributes:
+        planes: places across x, then y, then z [length], increasing along each axis.
+        first: index of the first plane of each axis.
+        counts: number of cells along each axis.
+    """
+
+    planes: mi.Float
+    first: list[mi.Int32]
+    counts: list[mi.Int32]
+
+    @classmethod
+    def from_planes(cls, planes: list[np.ndarray]) -> PlaneGrid:
+        """Upload the planes of the three axes."""
+        sizes = [len(axis) for axis in planes]
+        first = [dr.opaque(mi.Int32, sum(sizes[:a])) for a in range(3)]
+        counts = [dr.opaque(mi.Int32, n - 1) for n in sizes]
+        return cls(mi.Float(np.concatenate(planes).astype(np.float32)), first, counts)
+
+    def find_cell(self, p: mi.Point3f) -> tuple[mi.Vector3i, mi.Bool]:
+        """The cells that hold points, and whether the points lie in the box; other points get the nearest cell."""
+        cell, inside = mi.Vector3i(), mi.Bool(True)
+        for a, (x, first, count) in enumerate(zip(mi.Point3f(p), self.first, self.counts, strict=True)):
+            lies_behind = lambda k, x=x, first=first, count=count: (  # noqa: E731
+                (mi.Int32(k) < count) & (dr.gather(mi.Float, self.planes, first + dr.minimum(mi.Int32(k), count)) <= x)
+            )
+            cell[a] = dr.maximum(mi.Int32(dr.binary_search(0, MAX_COUNT, lies_behind)) - 1, 0)
+            inside &= (x >= dr.gather(mi.Float, self.planes, first)) & (x <= dr.gather(mi.Float, self.planes, first + count))
+        return cell, inside
 
 
 def list_gaussians(means: np.ndarray, whitening: np.ndarray, reach: float) -> CellLists:
@@ -320,45 +367,70 @@ def list_gaussians(means: np.ndarray, whitening: np.ndarray, reach: float) -> Ce
     spread = reach * np.sqrt((np.linalg.inv(whitening) ** 2).sum(axis=2))
     low, high = (means - spread).min(axis=0), (means + spread).max(axis=0)
     slack = SLACK * (high - low).max()
-    low, edge = low - slack, high - low + 2 * slack
-    size = _choose_resolution(edge, len(means))
-    first, last = (np.clip(_locate_cells(p, low, edge, size), 0, size) for p in (means - spread, means + spread))
-    counts = (last - first + 1).prod(axis=1)
+    low, high = low - slack, high + slack
+    wanted = float(np.clip(CELLS_PER_GAUSSIAN * len(means), MIN_CELLS, MAX_CELLS))
+    while True:
+        planes = _place_planes(means, low, high, wanted)
+        first, last = (
+            np.stack([_locate_cells(planes[a], p[:, a]) for a in range(3)], axis=1) for p in (means - spread, means + spread)
+        )
+        counts = (last - first + 1).prod(axis=1)
+        if counts.mean() <= MAX_REACHED or wanted <= MIN_CELLS:
+            break
+        wanted = max(wanted / 2, MIN_CELLS)
     _check_memory(counts)
+    margin = ROUNDING * np.maximum(np.abs(low), np.abs(high))
     touched = [
-        _find_touched_cells(index, first[index], last[index], (means - low) / edge * size, whitening * (edge / size), reach)
+        _find_touched_cells(index, first[index], last[index], means, whitening, (planes, margin), reach)
         for index in np.split(np.arange(len(means)), find_chunk_starts(counts))
     ]
     cells, entries = (np.concatenate(rows) for rows in zip(*touched, strict=True))
-    cells = cells @ np.cumprod([1, *(size[:2] + 1)])
+    size = np.array([len(axis) - 1 for axis in planes])
+    cells = cells @ np.cumprod([1, *size[:2]])
     order = np.argsort(cells, kind="stable")
-    starts = np.concatenate([[0], np.cumsum(np.bincount(cells, minlength=int((size + 1).prod())))])
-    to_world = np.diag([*edge, 1.0])
-    to_world[:3, 3] = low
-    return CellLists(to_world, tuple(int(n) for n in size[::-1]), starts.astype(np.uint32), entries[order].astype(np.uint32))
+    starts = np.concatenate([[0], np.cumsum(np.bincount(cells, minlength=int(size.prod())))])
+    return CellLists(planes, starts.astype(np.uint32), entries[order].astype(np.uint32))
 
 
-def _choose_resolution(edge: np.ndarray, count: int) -> np.ndarray:
-    """Nodes (x, y, z) that make the cells nearly cubic."""
-    cells = np.clip(CELLS_PER_GAUSSIAN * count, MIN_CELLS, MAX_CELLS)
-    return np.clip(np.rint(edge / (edge.prod() / cells) ** (1 / 3)), 1, MAX_NODES).astype(np.int64)
+def _place_planes(means: np.ndarray, low: np.ndarray, high: np.ndarray, cells: float) -> list[np.ndarray]:
+    """Planes across x, y and z, at quantiles of the means, for about the given number of cells."""
+    inner = np.diff(np.quantile(means, INNER, axis=0), axis=0)[0]
+    edge = np.maximum(inner, SLACK * (high - low).max())
+    counts = np.clip(np.rint(edge / (edge.prod() / cells) ** (1 / 3)), 1, MAX_COUNT).astype(int)
+    planes = []
+    for a, count in enumerate(counts):
+        places = np.quantile(means[:, a], np.arange(1, count) / count)
+        # Many means in one place would give several planes there.
+        steps = np.unique(np.rint((places - low[a]) / (high[a] - low[a]) * STEPS))
+        inside = low[a] + steps[(steps > 0) & (steps < STEPS)] / STEPS * (high[a] - low[a])
+        planes.append(np.unique(np.float32([low[a], *inside, high[a]])).astype(np.float64))
+    return planes
 
 
-def _locate_cells(p: np.ndarray, low: np.ndarray, edge: np.ndarray, size: np.ndarray) -> np.ndarray:
-    return np.floor((p - low) / edge * size + 0.5).astype(np.int64)
+def _locate_cells(planes: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Cells of coordinates along an axis; (N,) int64."""
+    return np.clip(np.searchsorted(planes, x, side="right") - 1, 0, len(planes) - 2)
 
 
 def _find_touched_cells(
-    index: np.ndarray, first: np.ndarray, last: np.ndarray, means: np.ndarray, whitening: np.ndarray, reach: float
+    index: np.ndarray,
+    first: np.ndarray,
+    last: np.ndarray,
+    means: np.ndarray,
+    whitening: np.ndarray,
+    grid: tuple[list[np.ndarray], np.ndarray],
+    reach: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of touched cells (n, 3) and Gaussians (n,); ``means`` and ``whitening`` are in units of cells."""
+    """Pairs of touched cells (n, 3) and Gaussians (n,); ``grid`` holds the planes and the margin around cells [length]."""
+    planes, margin = grid
     sizes = last - first + 1
     owner = np.repeat(index, sizes.prod(axis=1))
     cell = np.repeat(first, sizes.prod(axis=1), axis=0) + list_box_nodes(sizes)
+    near, far = (np.stack([planes[a][cell[:, a] + k] for a in range(3)], axis=1) for k in (0, 1))
     W = whitening[owner]
     # Largest distance of a point of the cell from its middle, in standard deviations: |W| applied to half the edges.
-    size = np.linalg.norm(np.abs(W) @ np.full(3, 0.5 + SLACK), axis=1)
-    distance = np.linalg.norm(np.einsum("nij,nj->ni", W, cell - means[owner]), axis=1)
+    size = np.linalg.norm(np.einsum("nij,nj->ni", np.abs(W), (0.5 + SLACK) * (far - near) + margin), axis=1)
+    distance = np.linalg.norm(np.einsum("nij,nj->ni", W, (near + far) / 2 - means[owner]), axis=1)
     touches = distance - size <= reach
     return cell[touches], owner[touches]
 

@@ -92,10 +92,9 @@ def lists_of(cloud: oracle.Cloud) -> CellLists:
 
 def cells_of(lists: CellLists, p: np.ndarray) -> np.ndarray:
     """The number of the cell of each point."""
-    size = np.array(lists.res[::-1])
-    u = (p - lists.to_world[:3, 3]) / np.diag(lists.to_world)[:3]
-    assert ((u >= 0) & (u <= 1)).all()
-    return np.floor(u * size + 0.5).astype(int) @ np.cumprod([1, *(size[:2] + 1)])
+    assert all(((x >= axis[0]) & (x <= axis[-1])).all() for axis, x in zip(lists.planes, p.T, strict=True))
+    index = [np.searchsorted(axis, x, side="right") - 1 for axis, x in zip(lists.planes, p.T, strict=True)]
+    return np.stack(index, axis=1) @ np.cumprod([1, *(len(axis) - 1 for axis in lists.planes[:2])])
 
 
 @pytest.mark.parametrize("parts", [1, 50])
@@ -104,7 +103,7 @@ def test_a_gaussian_is_listed_wherever_it_reaches(parts: int, monkeypatch: pytes
     cloud = oracle.Cloud.of(random_gaussians(300, 0))
     monkeypatch.setattr(gaussian_field, "MAX_CHUNK_PAIRS", gaussian_field.MAX_CHUNK_PAIRS if parts == 1 else 1000)
     lists, rng = lists_of(cloud), np.random.default_rng(1)
-    assert min(lists.res) > 3
+    assert min(len(axis) for axis in lists.planes) > 4
     whitening = cloud.whitening()
     for index in range(300):
         u = rng.normal(size=(50, 3))
@@ -121,7 +120,8 @@ def test_a_thin_gaussian_across_the_box_is_in_few_cells() -> None:
     cloud.quaternions[0] = [1 + axis @ along, *np.cross(axis, along)]
     lists = lists_of(cloud)
     listed = int((lists.entries == 0).sum())
-    assert 6 <= listed <= 8 * 3 * max(lists.res) < 0.6 * np.prod(lists.res)
+    sizes = [len(axis) - 1 for axis in lists.planes]
+    assert 6 <= listed <= 8 * 3 * max(sizes) < 0.6 * np.prod(sizes)
 
 
 def test_the_largest_sum_is_that_of_the_fullest_cell() -> None:
@@ -129,8 +129,36 @@ def test_the_largest_sum_is_that_of_the_fullest_cell() -> None:
     weight = np.random.default_rng(0).uniform(size=100)
     cells = zip(lists.starts[:-1], lists.starts[1:], strict=True)
     assert lists.max_cell_sum(weight) == pytest.approx(max(weight[lists.entries[a:b]].sum() for a, b in cells))
-    first = CellLists(np.eye(4), (1, 1, 1), np.uint32([0, 2, 3]), np.uint32([0, 1, 1]))  # the first cell is the fullest
+    first = CellLists([np.zeros(2)] * 3, np.uint32([0, 2, 3]), np.uint32([0, 1, 1]))  # the first cell is the fullest
     assert first.max_cell_sum(np.array([1.0, 2.0])) == 3
+
+
+def test_lists_stay_short_where_a_few_are_far_away() -> None:
+    """As in fits of photographs, where Gaussians of the sky stand 50 times as far as the others: equal cells would put all
+    others into one cell."""
+    given = random_gaussians(2000, 0)
+    given.means[:100] *= 50
+    given.log_scales[:] -= 2
+    lists = lists_of(oracle.Cloud.of(given))
+    assert np.diff(lists.starts).max() < 0.1 * 2000
+
+
+def test_wide_gaussians_get_fewer_cells() -> None:
+    """Of 2000 cells, each of these would reach into most."""
+    given = random_gaussians(2000, 0)
+    given.log_scales[:] = np.log(0.3)
+    assert len(lists_of(oracle.Cloud.of(given)).entries) <= gaussian_field.MAX_REACHED * 2000
+
+
+def test_means_in_one_place_make_thin_cells_no_thinner_than_a_step() -> None:
+    """Planes stay apart, and a flat cloud has one cell across."""
+    given = random_gaussians(1000, 0)
+    given.means[:500] = 0.1 + 1e-6 * given.means[:500]
+    lists = lists_of(oracle.Cloud.of(given))
+    assert all((np.diff(axis) > 0.9 * (axis[-1] - axis[0]) / gaussian_field.STEPS).all() for axis in lists.planes)
+    given.means[:, 2] = 0
+    given.log_scales[:, 2] = -20
+    assert len(lists_of(oracle.Cloud.of(given)).planes[2]) <= 3
 
 
 def test_what_cannot_be_listed_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

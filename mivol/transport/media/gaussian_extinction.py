@@ -14,8 +14,8 @@ from mivol.fields.gaussian_line import ROW_SIZE, SCALE_COLUMN, LineSlopes, White
 from mivol.fields.harmonics import blocks_per_gaussian
 from mivol.numerics import fast_max, fast_min
 from mivol.transport.media.extinction import RayInterval
-from mivol.transport.traversal.grid_walk import Cell, walk_cells
-from mivol.transport.traversal.lattice import Lattice, Segment, clip_to_grid
+from mivol.transport.traversal.box import UNIT_CUBE, Box, clip_to_box
+from mivol.transport.traversal.plane_walk import walk_planes
 from mivol.transport.traversal.rays import Ray
 
 __all__ = ["GaussianExtinction", "Passage", "add_to_block"]
@@ -26,12 +26,14 @@ class Passage:
     """The part of an interval of a ray inside the box of the Gaussians.
 
     Attributes:
-        segment: in the lattice of the Gaussians.
+        start: distance of the start from the origin of the ray [length].
+        length: length inside the box [length].
         o, d: start and direction; distances are from the start [length].
         active: lanes with a passage.
     """
 
-    segment: Segment
+    start: mi.Float64
+    length: mi.Float
     o: mi.Point3f
     d: mi.Vector3f
     active: mi.Bool
@@ -61,7 +63,7 @@ class GaussianExtinction:
     channels: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
-        self.cells = Lattice(dr.zeros(mi.TensorXf, (*self.field.lists.res, 1)), self.field.to_world)
+        self.box = Box(self.field.to_world).rows()
         self.colours = None
         if self.shows:
             with dr.suspend_grad():
@@ -126,9 +128,11 @@ class GaussianExtinction:
     def enter(self, interval: RayInterval) -> Passage:
         """The part of an interval inside the box, from its start on: far from the origin float32 has few digits."""
         ray = interval.ray
-        segment = clip_to_grid(self.cells, ray.o, ray.d, interval.t0, interval.t1)
-        there = (dr.fma(segment.start, mi.Float64(v), mi.Float64(x)) for x, v in zip(ray.o, ray.d, strict=True))
-        return Passage(segment, mi.Point3f(*(mi.Float(x) for x in there)), ray.d, interval.active & (segment.length > 0))
+        _, _, t0, t1 = clip_to_box(self.box, *UNIT_CUBE, ray.o, ray.d, mi.Float64(interval.t0), mi.Float64(interval.t1))
+        hits = t1 > t0
+        start, length = dr.select(hits, t0, 0), mi.Float(dr.select(hits, t1 - t0, 0))
+        there = (dr.fma(start, mi.Float64(v), mi.Float64(x)) for x, v in zip(ray.o, ray.d, strict=True))
+        return Passage(start, length, mi.Point3f(*(mi.Float(x) for x in there)), ray.d, interval.active & (length > 0))
 
     def visit_gaussians(
         self,
@@ -136,7 +140,7 @@ class GaussianExtinction:
         state: Any,
         add: Callable[..., Any],
         until: Callable[[Any], mi.Bool] | None = None,
-        leave: Callable[[Any, Cell], Any] | None = None,
+        leave: Callable[[Any, mi.Float], Any] | None = None,
     ) -> Any:
         """Visit each Gaussian on a passage once, in the cell of its entry.
 
@@ -146,25 +150,25 @@ class GaussianExtinction:
             add: ``add(state, line, index, ends) -> state`` with the distances at which the passage enters and leaves the
                 Gaussian. Called once, while Dr.Jit traces the loop.
             until: ``until(state) -> mask`` of lanes to stop, evaluated after each cell; None to go to the end.
-            leave: ``leave(state, cell) -> state``, after the Gaussians of a cell; by default nothing.
+            leave: ``leave(state, t) -> state``, after the Gaussians of a cell up to the distance t; by default nothing.
 
         Cost: a test of each Gaussian in the list of a cell; ``add`` runs for each Gaussian on the line.
         """
-        field, through, length = self.field, (passage.o, passage.d), passage.segment.length
+        field, through, length = self.field, (passage.o, passage.d), passage.length
 
-        def visit(state: Any, cell: Cell, on: mi.Bool) -> Any:
+        def visit(state: Any, cell: mi.Vector3i, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> Any:
             def meet(state: Any, line: WhitenedLine, index: mi.UInt32) -> Any:
                 start, end = line.chord
                 ends = fast_max(start, 0), fast_min(end, length)
                 # Cells follow each other without a gap, so the place of entry lies in one of them.
-                enters = line.hits & (ends[1] > ends[0]) & (ends[0] >= cell.s) & (ends[0] < cell.s + cell.dt)
+                enters = line.hits & (ends[1] > ends[0]) & (ends[0] >= t0) & (ends[0] < t1)
                 # Most are not met: a branch costs two thirds of what adding 0 for them did.
                 return dr.if_stmt((state,), enters, lambda state: add(state, line, index, ends), lambda state: state)
 
-            state = field.visit_cell(cell.lower + 1, through, on, state, meet)
-            return state if leave is None else leave(state, cell)
+            state = field.visit_cell(cell, through, on, state, meet)
+            return state if leave is None else leave(state, t1)
 
-        return walk_cells(self.cells, passage.segment, visit, state, (), passage.active, until)
+        return walk_planes(field.grid, *through, length, visit, state, passage.active, until)
 
     def jvp_value(
         self, line: WhitenedLine, slopes: LineSlopes, value: mi.Float, tangent: mi.Float, index: mi.UInt32

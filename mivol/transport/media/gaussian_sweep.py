@@ -40,8 +40,7 @@ from mivol.transport.media.compositing import BodyIntegral, CellIntegral, Revers
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction, add_to_block
 from mivol.transport.media.ray_intervals import MediumInterval
-from mivol.transport.traversal.grid_walk import Cell, walk_cells
-from mivol.transport.traversal.lattice import clip_to_grid
+from mivol.transport.traversal.plane_walk import walk_planes
 
 __all__ = ["GaussianSweep", "visit_far_to_near"]
 
@@ -192,26 +191,24 @@ def visit_far_to_near(part: GaussianExtinction, interval: RayInterval, state: An
     Cost: a test of each Gaussian in the list of a cell, once for each ``SLOTS`` peaks in the cell; ``add`` runs once a peak.
     """
     passage = part.enter(interval)
-    ray = interval.ray
-    segment = clip_to_grid(part.cells, ray.o, -ray.d, -mi.Float64(interval.t1), -mi.Float64(interval.t0))
-    field, through, length, rows = part.field, (passage.o, passage.d), passage.segment.length, part.field.flat
+    field, through, length, rows = part.field, (passage.o, passage.d), passage.length, part.field.flat
     start = dr.full(mi.Float, dr.inf, dr.width(passage.d))
 
     def ends_of(line: WhitenedLine) -> tuple[mi.Float, mi.Float]:
         near, far = line.chord
         return fast_max(near, 0), fast_min(far, length)
 
-    def visit(state: Any, cell: Cell, on: mi.Bool) -> Any:
+    def visit(state: Any, cell: mi.Vector3i, s0: mi.Float, s1: mi.Float, on: mi.Bool) -> Any:
         def fill(more: mi.Bool, last: tuple, state: Any) -> tuple:
             def meet(slots: list, line: WhitenedLine, index: mi.UInt32) -> list:
                 ends = ends_of(line)
-                place = fast_min(fast_max(segment.length - line.peak, 0), segment.length * LAST_PLACE)
-                holds_peak = line.hits & (ends[1] > ends[0]) & (place >= cell.s) & (place < cell.s + cell.dt)
+                place = fast_min(fast_max(length - line.peak, 0), length * LAST_PLACE)
+                holds_peak = line.hits & (ends[1] > ends[0]) & (place >= s0) & (place < s1)
                 holds_peak &= _is_farther(last, (line.peak, index))
                 return dr.if_stmt((slots,), holds_peak, lambda slots: _insert(slots, (line.peak, index)), lambda slots: slots)
 
             empty = (dr.full(mi.Float, -dr.inf, dr.width(start)), dr.zeros(mi.UInt32, dr.width(start)))
-            slots = field.visit_cell(cell.lower + 1, through, more, [empty] * SLOTS, meet)
+            slots = field.visit_cell(cell, through, more, [empty] * SLOTS, meet)
             last = slots[-1]
 
             def take(slots: list, state: Any) -> tuple:
@@ -227,7 +224,8 @@ def visit_far_to_near(part: GaussianExtinction, interval: RayInterval, state: An
         first = (start, dr.zeros(mi.UInt32, dr.width(start)))
         return dr.while_loop((on, first, state), lambda more, *_: more, fill, label="Gaussians of a cell, sorted")[2]
 
-    return walk_cells(part.cells, segment, visit, state, (), passage.active & (segment.length > 0))
+    end = mi.Point3f(dr.fma(passage.d, length, passage.o))
+    return walk_planes(field.grid, end, -passage.d, length, visit, state, passage.active)
 
 
 def _is_farther(a: tuple[mi.Float, mi.UInt32], b: tuple[mi.Float, mi.UInt32]) -> mi.Bool:

@@ -193,13 +193,13 @@ def sample_gaussian_flight(
         t = fast_min(fast_max(t, ends[0]), ends[1])
         return dr.select(hits & (t < nearest), t, nearest), reached, rng
 
-    def leave(state: tuple, cell: Cell) -> tuple:
-        return state[0], cell.s + cell.dt, state[2]
+    def leave(state: tuple, t: mi.Float) -> tuple:
+        return state[0], t, state[2]
 
     width = dr.width(passage.d)
     start = (dr.full(mi.Float, dr.inf, width), dr.zeros(mi.Float, width), mi.UInt32(rng))
     nearest, _, rng = part.visit_gaussians(passage, start, add, lambda state: state[0] <= state[1], leave)
-    return dr.select(dr.isfinite(nearest), passage.segment.start + mi.Float64(nearest), dr.inf), rng
+    return dr.select(dr.isfinite(nearest), passage.start + mi.Float64(nearest), dr.inf), rng
 
 
 @dataclass
