@@ -11,7 +11,7 @@ import sys
 
 import mitsuba as mi
 
-MODULES = ("volumes", "phases", "media", "integrators")  # order = dependency order
+MODULES = ("volumes", "phases", "media", "sensors", "integrators")  # order = dependency order
 
 
 def _register() -> None:

@@ -13,14 +13,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mivol.scene.stand_in import ARRAYS, FOUND_SENSOR, RECORDED_FILM, describe_kind
 from mivol.scene_graph import find_children, list_values, traverse
 from mivol.transport.path.film import find_batch_views
 
 FOLLOWED = ("data", "value")
 """Names of the parameters of volumes and textures whose values a recording follows."""
-
-FOLLOWED_SENSOR, RECORDED_FILM = "PerspectiveCamera", "HDRFilm"
-"""The sensor and the film that can be recorded. Mitsuba 3.9.1 shows Dr.Jit the arrays of no other camera but ``batch``."""
 
 RECORDED_BACK_ENDS = ("llvm",)
 """Back ends on which renders are recorded. On a GPU, Dr.Jit 1.5 reads the handle of a hardware texture from memory that other
@@ -122,9 +120,10 @@ def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:
     if sensor.film().class_name() != RECORDED_FILM:
         return f"the film is a {sensor.film().class_name()}"
     views = [sensor] if find_batch_views(sensor) is None else find_children(sensor).values()
-    strange = sorted({v.class_name() for v in views if isinstance(v, mi.Sensor)} - {FOLLOWED_SENSOR})
-    if strange:
-        return f"the sensor is a {strange[0]}"
+    strange = sorted({v.class_name() for v in views if isinstance(v, mi.Sensor)} - {FOUND_SENSOR})
+    if strange and describe_kind(sensor) is None:
+        what = f" with a sampler of the kind {sensor.sampler().class_name()}" if strange[0] in ARRAYS else ""
+        return f"the sensor is a {strange[0]}{what}"
     params = traverse(scene)
     nodes = [node for node in params.hierarchy if not _is_of_mivol(node)]
     foreign = sorted({type(node).__name__ for node in nodes if type(node).__module__.partition(".")[0] != "mitsuba"})
@@ -153,7 +152,7 @@ def _is_followed(owner: mi.Object, key: str) -> bool:
         return key.endswith("phase_function.g")
     if isinstance(owner, mi.Volume | mi.Texture):
         return key.rpartition(".")[2] in FOLLOWED
-    return isinstance(owner, mi.Sensor) and owner.class_name() == FOLLOWED_SENSOR
+    return isinstance(owner, mi.Sensor) and owner.class_name() in ARRAYS
 
 
 def _is_of_mivol(node: mi.Object) -> bool:

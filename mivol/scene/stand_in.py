@@ -15,8 +15,20 @@ from weakref import WeakValueDictionary
 import drjit as dr
 import mitsuba as mi
 
-from mivol.scene.scene_state import FOLLOWED_SENSOR, RECORDED_FILM
 from mivol.scene_graph import traverse
+
+RECORDED_FILM = "HDRFilm"
+"""The film that can be recorded."""
+
+FOUND_SENSOR = "PerspectiveCamera"
+"""The sensor whose arrays Dr.Jit finds. Mitsuba 3.9.1 shows Dr.Jit the arrays of no other camera but ``batch``."""
+
+ARRAYS = {
+    FOUND_SENSOR: ("x_fov", "principal_point_offset_x", "principal_point_offset_y"),
+    "OrthographicCamera": (),
+    "ThinLensCamera": ("x_fov", "aperture_radius", "focus_distance"),
+}
+"""Classes of cameras that may have a stand-in, with the names of their parameters that are arrays, besides ``to_world``."""
 
 FORMATS = {
     "y": "luminance",
@@ -29,16 +41,17 @@ FORMATS = {
 """Names of pixel formats of ``hdrfilm``, by the names that ``hdrfilm`` prints."""
 
 NUMBERS = ("near_clip", "far_clip", "shutter_open", "shutter_open_time")
-ARRAYS = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
 
 
 def describe_kind(sensor: mi.Sensor) -> str | None:
     """The common properties of cameras with the same stand-in; None if a camera has no stand-in."""
-    film, sampler = sensor.film(), sensor.sampler()
-    is_plain = sensor.class_name() == FOLLOWED_SENSOR and film.class_name() == RECORDED_FILM
+    film, sampler, name = sensor.film(), sensor.sampler(), sensor.class_name()
+    is_plain = name in ARRAYS and film.class_name() == RECORDED_FILM
     if not is_plain or sampler.class_name() != "IndependentSampler" or sensor.get_medium() is not None:
         return None
-    return f"{film}{sampler.sample_count()}" if _pixel_format(film) in FORMATS else None
+    # Constants of a camera in Python; parameters of a perspective camera.
+    times = "" if name == FOUND_SENSOR else f"{sensor.shutter_open()} {sensor.shutter_open_time()}"
+    return f"{name}{times}{film}{sampler.sample_count()}" if _pixel_format(film) in FORMATS else None
 
 
 def _pixel_format(film: mi.Film) -> str:
@@ -99,10 +112,15 @@ class StandIn:
             "rfilter": film.rfilter(),
         }
         sampler = {"type": "independent", "sample_count": sensor.sampler().sample_count()}
-        self.camera = mi.load_dict(
-            {"type": "perspective", "film": {"type": "hdrfilm", **own}, "sampler": sampler}, parallel=False
-        )
-        self._params = traverse(self.camera)
+        parts = {"film": {"type": "hdrfilm", **own}, "sampler": sampler}
+        self._is_found = sensor.class_name() == FOUND_SENSOR
+        if self._is_found:
+            self.camera = mi.load_dict({"type": "perspective", **parts}, parallel=False)
+            self._params = traverse(self.camera)
+        else:
+            opened, closed = sensor.shutter_open(), sensor.shutter_open() + sensor.shutter_open_time()
+            parts |= {"shutter_open": opened, "shutter_close": closed, "on_lens": sensor.needs_aperture_sample()}
+            self.camera = mi.load_dict({"type": "mivol_copied_camera", **parts}, parallel=False)
         self._shown: tuple[list[Any], list[Any]] | None = None
         self._met: set[int] = set()
 
@@ -110,21 +128,25 @@ class StandIn:
         """Take the numbers of a camera of the kind."""
         given = traverse(sensor)
         numbers, matrix = [given[name] for name in NUMBERS], given["to_world"].matrix
-        arrays = [dr.detach(given[name]) for name in ARRAYS]
-        state = [*numbers, *(array.index for array in arrays), *dr.detail.collect_indices(matrix)]
+        arrays = {name: dr.detach(given[name]) for name in ARRAYS[sensor.class_name()]}
+        state = [*numbers, *(array.index for array in arrays.values()), *dr.detail.collect_indices(matrix)]
         if self._shown is not None and self._shown[0] == state:
             return
         # Arrays of its own: shared arrays would tell the cameras apart.
         is_own = dr.opaque(mi.Bool, True)
-        for name, number in zip(NUMBERS, numbers, strict=True):
-            self._params[name] = number
-        for name, array in zip(ARRAYS, arrays, strict=True):
-            self._params[name] = dr.select(is_own, array, 0)
-        copied = dr.unravel(type(matrix), dr.select(is_own, dr.ravel(dr.detach(matrix)), 0))
-        self._params["to_world"] = type(given["to_world"])(copied)
-        self._params.update()
+        copies = {name: dr.select(is_own, array, 0) for name, array in arrays.items()}
+        to_world = dr.unravel(type(matrix), dr.select(is_own, dr.ravel(dr.detach(matrix)), 0))
+        if self._is_found:
+            for name, number in zip(NUMBERS, numbers, strict=True):
+                self._params[name] = number
+            for name, array in copies.items():
+                self._params[name] = array
+            self._params["to_world"] = type(given["to_world"])(to_world)
+            self._params.update()
+        else:
+            self.camera.take(to_world, *(dr.opaque(mi.Float, number) for number in numbers[:2]), **copies)
         # Held: Dr.Jit would give the index of a freed array to another array.
-        self._shown = state, [arrays, matrix]
+        self._shown = state, [*arrays.values(), matrix]
 
     def meet(self, sensor: mi.Sensor, others: Sequence[mi.Sensor], names: list[str]) -> None:
         """Give the films of cameras an image, if they have none, and their samplers numbers: both would come with a render.

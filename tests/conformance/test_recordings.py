@@ -337,25 +337,59 @@ def test_an_image_and_a_gradient_are_recorded_once_in_any_order(order: str) -> N
         assert integrator.session.recordings.count == 2
 
 
-def test_the_cameras_of_a_scene_are_recorded_once() -> None:
+LENSES = {
+    "perspective": [{"fov": 30.0}, {"fov": 31.0, "near_clip": 0.5}, {"fov": 32.0, "principal_point_offset_x": 0.1}],
+    "orthographic": [{}, {"near_clip": 0.5}, {"far_clip": 4.0}],
+    "thinlens": [
+        {"fov": 30.0, "aperture_radius": 0.3, "focus_distance": 4.0},
+        {"fov": 31.0, "aperture_radius": 0.1, "focus_distance": 3.0, "near_clip": 0.5},
+        {"fov": 32.0, "aperture_radius": 0.3, "focus_distance": 3.0, "far_clip": 4.0},
+    ],
+}
+
+
+@pytest.mark.parametrize("kind", LENSES)
+def test_the_cameras_of_a_scene_are_recorded_once(kind: str) -> None:
     """Another camera takes their place: images to the last bit, and each on the film of its own camera."""
-    eyes = [camera((4 * np.sin(a), -4 * np.cos(a), 1.0), (0.0, 0.0, 0.0), res=6, fov=30.0 + a) for a in (0.0, 1.0, 2.0)]
-    eyes[1]["near_clip"], eyes[2]["principal_point_offset_x"] = 0.5, 0.1
+    angles = (0.0, 1.0, 2.0)
+    eyes = [camera((4 * np.sin(a), -4 * np.cos(a), 1.0), (0.0, 0.0, 0.0), res=6) for a in angles]
+    for eye, lens in zip(eyes, LENSES[kind], strict=True):
+        eye.pop("fov")
+        eye |= {"type": kind, "shutter_close": 0.0 if kind == "perspective" else 0.3, **lens}
     pair = Pair(smoke_under(**{"sky": sky(0.7)} | {f"eye{k}": eye for k, eye in enumerate(eyes)}), 3)
     cameras = pair.scene.sensors()
     assert len(cameras) == 4
     for seed in range(2):
-        for number in (0, 1, 3, 2, 1):
+        # The last camera is a perspective one.
+        for number in (0, 1, 3, 2, 1) if kind == "perspective" else (0, 1, 2, 1):
             pair.assert_same(seed, sensor=number)
             recorded = np.array(mi.render(pair.scene, integrator=pair.recorded, sensor=number, seed=9, spp=2))
             np.testing.assert_array_equal(np.array(cameras[number].film().develop()), recorded)
     assert pair.recordings.count == 1
 
 
+@pytest.mark.parametrize("kind", LENSES)
+def test_a_stand_in_has_the_rays_of_the_given_camera(kind: str) -> None:
+    """To the last bit, on a cropped film."""
+    crop = {"width": 8, "height": 6, "crop_width": 4, "crop_height": 3, "crop_offset_x": 1, "crop_offset_y": 2}
+    to_world = mi.ScalarTransform4f().look_at([3, -4, 1], [0.2, 0.1, 0], [0, 0, 1])
+    for lens in LENSES[kind]:
+        sensor = mi.load_dict({"type": kind, "to_world": to_world, "film": {"type": "hdrfilm", **crop}, **lens})
+        stand_in = StandIn.find(sensor)
+        stand_in.show(sensor)
+        numbers = mi.Point2f(0.1, [0.2, 0.7]), mi.Point2f([0.9, 0.3], 0.4)
+        (found, weight), (truth, its_weight) = (
+            one.sample_ray_differential(mi.Float(0.5), mi.Float(0), *numbers) for one in (stand_in.camera, sensor)
+        )
+        for name in ("o", "d", "maxt", "time"):
+            np.testing.assert_array_equal(np.array(getattr(found, name)), np.array(getattr(truth, name)), name)
+        np.testing.assert_array_equal(np.array(weight), np.array(its_weight))
+
+
 @pytest.mark.parametrize("pixel_format", FORMATS.values())
 def test_a_stand_in_has_a_film_like_the_given_one(pixel_format: str) -> None:
-    """Another camera than a perspective one has no stand-in."""
-    assert describe_kind(mi.load_dict({"type": "orthographic"})) is None
+    """A camera without a picture has no stand-in."""
+    assert describe_kind(mi.load_dict({"type": "radiancemeter", "film": {"type": "hdrfilm", "width": 1, "height": 1}})) is None
     size = {"width": 8, "height": 6, "crop_width": 4, "crop_height": 3, "crop_offset_x": 1, "crop_offset_y": 2}
     film = {"type": "hdrfilm", "rfilter": {"type": "mitchell"}, "sample_border": True, "pixel_format": pixel_format, **size}
     sensor = mi.load_dict({"type": "perspective", "film": film, "sampler": {"type": "independent", "sample_count": 3}})
@@ -398,8 +432,11 @@ def test_what_cannot_be_recorded_is_named() -> None:
     scene = smoke_under("heterogeneous", phase={"type": "hg", "g": 0.4})
     assert find_hidden_arrays(scene, scene.sensors()[0]) is None
     film = {"type": "hdrfilm", "width": 4, "height": 4}
-    lens = mi.load_dict({"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 4.0, "film": film})
-    assert find_hidden_arrays(scene, lens) == "the sensor is a ThinLensCamera"
+    lens = {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 4.0, "film": film}
+    assert find_hidden_arrays(scene, mi.load_dict(lens)) is None
+    spread = mi.load_dict({**lens, "sampler": {"type": "multijitter"}})
+    sentence = "the sensor is a ThinLensCamera with a sampler of the kind MultijitterSampler"
+    assert find_hidden_arrays(scene, spread) == sentence
     pencils = mi.load_dict(batch_of(pencil((0, -4, 0), (0, 1, 0))))
     assert find_hidden_arrays(scene, pencils) == "the sensor is a RadianceMeter"
     microflakes = {"type": "sggx", "S": grid_volume("gridvolume", np.ones((1, 1, 1, 6), np.float32), PLACE)}
