@@ -54,7 +54,7 @@ def _explain_file(arguments: argparse.Namespace) -> Explanation | FileSummary:
 
 def explain_array(arguments: argparse.Namespace) -> int | None:
     """Explain a scan, or describe a volume or a field, and return the exit code; None for other inputs."""
-    from mivol.experiments.found_scan import SINOGRAM, TIFF_FOLDER, find_scan
+    from mivol.experiments.found_scan import describe_missing
     from mivol.files.formats import describe_volume
 
     layout = raw_layout(arguments)
@@ -69,10 +69,8 @@ def explain_array(arguments: argparse.Namespace) -> int | None:
     if not is_array:
         return None
     print(describe_volume(arguments.scene, arguments.dataset, **layout))
-    if arguments.dataset is None and find_scan(arguments.scene) in (TIFF_FOLDER, SINOGRAM):
-        print(
-            "a volume, for want of flats, darks and angles: mivol optimize takes it as a scan, mivol explain does so with --set"
-        )
+    if arguments.dataset is None and not layout and (missing := describe_missing(arguments.scene)):
+        print(missing)
     return 0
 
 
@@ -121,12 +119,14 @@ def is_fit(arguments: argparse.Namespace) -> bool:
 
 def check_contents(path: Path) -> None:
     """Refuse a volume, and binary data that no reader takes, in place of a scene, an experiment or a cloud."""
+    from mivol.experiments.found_scan import describe_missing
     from mivol.files.formats import is_unread, refuse_unread
 
     if is_unread(path):
         raise refuse_unread(path)
     if holds_volume(path):
-        raise MivolError(f"{path}: found a volume, expected a scene, a fit or points; render, explain and convert take it.")
+        found = describe_missing(path) or "a volume"
+        raise MivolError(f"{path}: found {found}, expected a scene, a fit or points; render, explain and convert take it.")
 
 
 def holds_volume(path: Path) -> bool:

@@ -24,11 +24,11 @@ from mivol.files.dicom_views import DicomViews, has_views, read_views, survey_vi
 from mivol.files.formats import HEAD, read_volume
 from mivol.files.hdf5 import is_hdf5
 from mivol.files.image_stack import IMAGES, read_images, stack_shape
-from mivol.files.mrc import find_tilt_angles, is_mrc, read_tilt_angles
+from mivol.files.mrc import TILT_ANGLES, find_tilt_angles, is_mrc, read_tilt_angles
 from mivol.files.nikon import SECTION, read_nikon
 from mivol.files.scan_hdf5 import half_turns_in_radians, is_scan, survey_projections
 from mivol.files.source import read_columns, refusal
-from mivol.files.tiff import group_images, natural_order
+from mivol.files.tiff import ImageGroup, group_images, natural_order
 from mivol.machine import available_memory
 from mivol.photos import find_format
 
@@ -72,6 +72,17 @@ def find_scan(path: Path) -> str | None:
     if not path.exists() or (path.is_dir() and find_format(path)):
         return None
     return next((name for name, (recognise, _) in SCAN_KINDS.items() if recognise(path)), None)
+
+
+def describe_missing(path: Path) -> str:
+    """Say what a volume lacks to be a scan; "" if nothing would make it one."""
+    if find_scan(path) in (TIFF_FOLDER, SINOGRAM):
+        way_out = "mivol optimize takes it as a scan, mivol explain does so with --set"
+        return f"a volume, for want of flats, darks and angles: {way_out}"
+    if path.suffix.lower() in (".mrc", ".st", ".ali") and path.is_file():
+        names = " or ".join(f"{path.stem}{suffix}" for suffix in TILT_ANGLES)
+        return f"a volume, for want of angles: a tilt series has a file {names} beside it, a line or a section for each image"
+    return ""
 
 
 def draft_scan(path: Path, changes: Sequence[str] = ()) -> ScanDraft:
@@ -271,8 +282,8 @@ def _draft_dicom(path: Path, given: dict[str, Any]) -> ScanDraft:
         f"found: angles from {scan.angles[0]:.4g} to {scan.angles[-1]:.4g} degrees",
         *(f"assumed: {line}" for line in scan.assumed),
     ]
-    reading, why = _guess_light(path, scan, stack)
-    lines.append(f"assumed: {why}: a pixel is taken as {reading['reading']}; data.reading sets it")
+    reading, why = ({}, "") if _has_reading(given) else _guess_light(path, scan, stack)
+    lines += [f"assumed: {why}: a pixel is taken as {reading['reading']}; data.reading sets it"] if reading else []
     distances = {"source_to_axis": scan.source_to_axis, "source_to_detector": scan.source_to_detector}
     beam: dict[str, Any] = {"beam": "cone"} | distances | {"pitch": scan.pitch}
     if any(scan.detector_offset):
@@ -295,11 +306,25 @@ def _guess_light(path: Path, scan: DicomViews, stack: np.ndarray) -> tuple[dict[
         found = f"PixelIntensityRelationship {scan.relation or 'empty'}" + ", falling with the light" * scan.is_falling
         expected = "values in proportion to the light (LIN), or falling logarithms of it (LOG, sign -1)"
         raise refusal(path, found, expected, "write the views as line integrals in TIFF, and the geometry as [scan]")
+    return guess_light(path, stack)
+
+
+def guess_light(path: Path, stack: np.ndarray) -> tuple[dict[str, Any], str]:
+    """Guess the quantity of a pixel as :func:`guess_reading`; without air at the edges, the brightest reading is the light.
+
+    Args:
+        path: file, for errors.
+        stack: views (views, rows, columns).
+
+    Raises:
+        MivolError: no reading above 0, or readings below 0.
+    """
     with suppress(MivolError):
         return guess_reading(path, stack[len(stack) // 2])
     brightest = float(f"{stack.max():.6g}")
-    if not brightest > 0:
-        raise refusal(path, f"readings of at most {brightest:g}", "light above 0", "name another series")
+    if not brightest > 0 or stack.min() < 0:
+        found = f"no air at the edges, and readings from {stack.min():g} to {brightest:g}"
+        raise refusal(path, found, "light, at or above 0", "set data.reading if they are transmissions or line integrals")
     reason = f"no air at the edges: the brightest reading, {brightest:g}, is the light without object (data.light)"
     return {"reading": "intensity", "light": brightest}, reason
 
@@ -316,18 +341,20 @@ def _is_tilt_series(path: Path) -> bool:
 
 
 def _draft_tilt_series(path: Path, given: dict[str, Any]) -> ScanDraft:
+    path, found = _one_file(path, _is_tilt_series)
     volume, table = read_volume(path), find_tilt_angles(path)
     assert table is not None
     angles, stack = read_tilt_angles(table), volume.values[..., 0]
     views, rows, columns = stack.shape
     if len(angles) != views:
         raise refusal(table, f"{len(angles)} angles", f"{views}, one for each image of {path.name}", "correct it")
-    reading, why = guess_reading(path, stack[views // 2])
+    reading, why = ({}, "") if _has_reading(given) else guess_light(path, stack)
     data = {"source": "stack", "file": str(path), "angles": str(table), "find_axis": False, "air": 0} | reading
     lines = [
+        *found,
         f"found: a tilt series in MRC: {_count(views, 'view')} of {rows} x {columns} pixels",
         f"found: angles from {angles[0]:.4g} to {angles[-1]:.4g} degrees in {table.name}",
-        f"assumed: {why}: the pixels are taken as {reading['reading']}s; data.reading sets it",
+        *([f"assumed: {why}: a pixel is taken as {reading['reading']}; data.reading sets it"] if reading else []),
         "assumed: a parallel beam, and a tilt axis along the columns of pixels (an aligned series)",
     ]
     scan: dict[str, Any] = {"beam": "parallel"}
@@ -344,6 +371,8 @@ def _draft_tilt_series(path: Path, given: dict[str, Any]) -> ScanDraft:
 
 def has_scan_files(folder: Path) -> bool:
     """Whether flats, darks or a file of angles lie beside the images of a folder: they tell a scan from slices of a volume."""
+    if not folder.is_dir():
+        return False
     if any(group.words & (FLAT_WORDS | DARK_WORDS) for group in group_images(folder, IMAGES)):
         return True
     for file in folder.iterdir():
@@ -355,25 +384,28 @@ def has_scan_files(folder: Path) -> bool:
 
 
 def _draft_tiff(path: Path, given: dict[str, Any]) -> ScanDraft:
-    groups = group_images(path, IMAGES)
+    folder = path if path.is_dir() else path.parent
+    groups = group_images(folder, IMAGES) if path.is_dir() else _groups_beside(path)
     darks = [group for group in groups if group.words & DARK_WORDS]
     flats = [group for group in groups if group.words & FLAT_WORDS and group not in darks]
-    views = [group for group in groups if group not in darks and group not in flats]
+    views = groups[:1] if path.is_file() else [group for group in groups if group not in darks and group not in flats]
     if not views:
         names = ", ".join(group.name for group in groups[:4])
         raise refusal(path, f"images of flats and darks alone ({names})", "views", 'write a TOML file with source = "stack"')
-    chosen = {"views": views[0], "flats": flats[0] if flats else None, "darks": darks[0] if darks else None}
+    chosen = {"views": views[0], "flats": _join_groups(flats), "darks": _join_groups(darks)}
     images = {role: read_images(group.files[:1]) for role, group in chosen.items() if group}
     counts = {role: len(group.files) * len(images[role]) if group else 0 for role, group in chosen.items()}
     rows, columns = images["views"].shape[1:]
     lines = [f"found: {chosen['views'].name}: {_count(counts['views'], 'view')} of {rows} x {columns} pixels"]
     lines += [f"found: {g.name}: {_count(counts[role], role[:-1])}" for role, g in chosen.items() if g and role != "views"]
-    left = [group.name for group in groups if group not in chosen.values()]
+    used = [file for group in chosen.values() if group for file in group.files]
+    left = [group.name for group in groups if group.files[0] not in used]
     lines += [f"found: {', '.join(left)}: not used; data.file, data.flats and data.darks name others"] if left else []
     data: dict[str, Any] = {"source": "stack", "file": chosen["views"].pattern()}
     if flats:
-        data |= {"reading": "intensity", "flats": flats[0].pattern()} | ({"darks": darks[0].pattern()} if darks else {})
-    else:
+        data |= {"reading": "intensity", "flats": chosen["flats"].pattern()}
+        data |= {"darks": chosen["darks"].pattern()} if darks else {}
+    elif not _has_reading(given):
         reading, why = guess_reading(path, images["views"][0])
         data |= reading
         lines.append(f"assumed: no flats, and {why}: the pixels are taken as {data['reading']}s; data.reading sets it")
@@ -383,10 +415,41 @@ def _draft_tiff(path: Path, given: dict[str, Any]) -> ScanDraft:
     three = _three_views(
         chosen["views"].files, *(images[role].mean(0) if role in images else None for role in ("flats", "darks"))
     )
-    lines += _draft_angles(path, scan, data, counts["views"], three)
+    lines += _draft_angles(folder, scan, data, counts["views"], three)
     lines += _draft_beam(scan, None, (None, None), (rows, columns))
     raw = {"scan": scan, "data": data}
     return _finish(raw, [*lines, *_put_grid(raw, rows, columns)], counts["views"])
+
+
+def _groups_beside(path: Path) -> list[ImageGroup]:
+    """A file of views, and the groups of equally large images in its folder: its flats and darks may be among them."""
+    others = [group for group in group_images(path.parent, IMAGES) if group.files[0].parent == path.parent]
+    size, found = stack_shape(path)[1:], [ImageGroup(path.name, [path])]
+    for group in others:
+        with suppress(MivolError):
+            found += [group] if path not in group.files and stack_shape(group.files[0])[1:] == size else []
+    return found
+
+
+def _join_groups(groups: list[ImageGroup]) -> ImageGroup | None:
+    """Flats before and after the scan as one group, if their images are equally large and one pattern finds them; else the
+    largest group; None without groups.
+    """
+    if not groups:
+        return None
+    size = stack_shape(groups[0].files[0])
+    alike = [group for group in groups if stack_shape(group.files[0]) == size]
+    files = sorted((file for group in alike for file in group.files), key=natural_order)
+    joined = ImageGroup(", ".join(group.name for group in alike), files)
+    with suppress(MivolError):
+        joined.pattern()
+        return joined
+    return groups[0]
+
+
+def _has_reading(given: dict[str, Any]) -> bool:
+    """Whether the changes say what a pixel means."""
+    return "reading" in given.get("data", {})
 
 
 def _draft_angles(folder: Path, scan: dict[str, Any], data: dict[str, Any], views: int, three: np.ndarray) -> list[str]:
@@ -488,26 +551,27 @@ def _three_views(files: list[Path], flat: np.ndarray | None, dark: np.ndarray | 
 # -- Sinogram ------------------------------------------------------------------------------------------------------------
 
 
-def _is_sinogram(path: Path) -> bool:
-    """Whether a file is a single grey image of a format of detectors."""
+def _count_images(path: Path) -> int:
+    """Images in a file of a format of detectors; 0 for other files."""
     if not path.is_file() or path.suffix.lower() not in IMAGES:
-        return False
+        return 0
     with suppress(MivolError):
-        return stack_shape(path)[0] == 1
-    return False
+        return stack_shape(path)[0]
+    return 0
 
 
 def _draft_sinogram(path: Path, given: dict[str, Any]) -> ScanDraft:
     image = read_images([path])[0]
     views, columns = image.shape
     data: dict[str, Any] = {"source": "stack", "file": str(path), "images": "sinograms"}
-    reading, why = guess_reading(path, image)
+    reading, why = ({}, "") if _has_reading(given) else guess_reading(path, image)
     data |= reading
     lines = [
         f"found: a single image of {views} x {columns} pixels",
         f"assumed: a sinogram, {_count(views, 'view')} of {columns} columns; turn the image if its columns are views",
-        f"assumed: no flats, and {why}: the pixels are taken as {data['reading']}s; data.reading sets it",
     ]
+    if reading:
+        lines.append(f"assumed: no flats, and {why}: the pixels are taken as {data['reading']}s; data.reading sets it")
     scan: dict[str, Any] = {"beam": "parallel"}
     lines += _draft_angles(path.parent, scan, data, views, image[[0, views // 2, -1], None])
     lines += _draft_beam(scan, None, (None, None), (1, columns))
@@ -515,13 +579,18 @@ def _draft_sinogram(path: Path, given: dict[str, Any]) -> ScanDraft:
     return _finish(raw, [*lines, *_put_grid(raw, 1, columns)], views)
 
 
+def _or_in_folder(recognise: Callable[[Path], bool]) -> Callable[[Path], bool]:
+    """The test of a file, which a folder passes by a file in it."""
+    return lambda path: any(map(recognise, path.iterdir())) if path.is_dir() else recognise(path)
+
+
 HDF5, TIFF_FOLDER, SINOGRAM = "hdf5", "tiff", "sinogram"
 SCAN_KINDS: dict[str, tuple[Callable[[Path], bool], Callable[[Path, dict[str, Any]], ScanDraft]]] = {
-    "nikon": (lambda path: any(map(_is_nikon, path.iterdir() if path.is_dir() else [path])), _draft_nikon),
+    "nikon": (_or_in_folder(_is_nikon), _draft_nikon),
     "dicom": (has_views, _draft_dicom),
-    HDF5: (lambda path: any(map(is_scan, path.iterdir() if path.is_dir() else [path])), _draft_hdf5),
-    "mrc": (_is_tilt_series, _draft_tilt_series),
-    TIFF_FOLDER: (lambda path: path.is_dir() and bool(group_images(path, IMAGES)), _draft_tiff),
-    SINOGRAM: (_is_sinogram, _draft_sinogram),
+    HDF5: (_or_in_folder(is_scan), _draft_hdf5),
+    "mrc": (_or_in_folder(_is_tilt_series), _draft_tilt_series),
+    TIFF_FOLDER: (lambda path: bool(group_images(path, IMAGES)) if path.is_dir() else _count_images(path) > 1, _draft_tiff),
+    SINOGRAM: (lambda path: _count_images(path) == 1, _draft_sinogram),
 }
 """Recognition and draft of each kind of scan, in this order."""

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mivol import config
-from mivol.config import Cone, Ellipsoids, Known, Matrices, OfData, Parallel, Readings, Table, is_circle
+from mivol.config import Cone, Ellipsoids, Known, Matrices, Nikon, OfData, Readings, Table, is_circle
 from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.experiments.readings import ScanReadings, even_angles, nikon_grid, note_order, note_rows, read_scan
@@ -91,18 +91,15 @@ def make_geometry(settings: config.ScanExperiment, base: Path) -> FlatDetector:
     return make_beam(settings, base, angles, scan.detector)
 
 
-def make_beam(
-    settings: config.ScanExperiment, base: Path, angles: np.ndarray, detector: tuple[int, int], axis_offset: float | None = None
-) -> FlatDetector:
-    """Return the beam of the settings, with these angles [rad] and pixels; a given ``axis_offset`` replaces the settings'."""
+def make_beam(settings: config.ScanExperiment, base: Path, angles: np.ndarray, detector: tuple[int, int]) -> FlatDetector:
+    """Return the beam of the settings, with these angles [rad] and pixels."""
     scan = settings.scan
     if isinstance(scan, Table):
         return PanelViews(read_columns(base / scan.file, COLUMNS), detector)
     if isinstance(scan, Matrices):
         matrices = read_columns(base / scan.file, COLUMNS).reshape(-1, 3, 4)
         return panels_from_matrices(matrices, detector, settings.grid.centre, scan.first_pixel)
-    offsets = {"axis_offset": scan.axis_offset if axis_offset is None else axis_offset, "detector_offset": scan.detector_offset}
-    offsets["tilt"] = np.radians(scan.tilt)
+    offsets = {"axis_offset": scan.axis_offset, "detector_offset": scan.detector_offset, "tilt": np.radians(scan.tilt)}
     if isinstance(scan, Cone):
         beam = ConeBeam(angles, detector, scan.source_to_axis, scan.source_to_detector, scan.pitch, **offsets)
         return beam if is_circle(scan) else helix(beam, scan.lift, scan.sources)
@@ -253,19 +250,21 @@ def read_measured(settings: config.ScanExperiment, base: Path, rows: slice = ALL
     y, ring_notes = correct_rings(measured, weights, data)
     notes += ring_notes
     removed = None if y is measured else (measured - y)[:, y.shape[1] // 2]
-    offset = None
-    if is_circle(settings.scan):
-        offset, axis_notes = resolve_axis(settings, base, y, weights, angles)
+    geometry = readings.geometry
+    if geometry is None:
+        geometry = make_beam(settings, base, np.arange(0) if angles is None else angles, y.shape[1:])
+    if geometry.shape != y.shape:
+        raise MivolError(f"found {len(y)} projections and a geometry of {geometry.shape[0]} views, expected as many.")
+    pictures += shown
+    if isinstance(geometry, ParallelBeam | ConeBeam):
+        offset, axis_notes = resolve_axis(settings.data, geometry, y, weights)
         notes += axis_notes
-    pictures += [*shown, *show_axis(settings, y, angles, offset)]
+        if offset is not None:
+            geometry = replace(geometry, axis_offset=offset)
+            pictures += show_axis(geometry, y)
     unused = int((weights == 0).sum())
     if unused:
         notes.append(f"{unused} of {weights.size} pixels have no light or no finite reading: they are not used")
-    geometry = readings.geometry
-    if geometry is None:
-        geometry = make_beam(settings, base, np.arange(0) if angles is None else angles, y.shape[1:], offset)
-    if geometry.shape != y.shape:
-        raise MivolError(f"found {len(y)} projections and a geometry of {geometry.shape[0]} views, expected as many.")
     is_noise_known = readings.intensity is not None and readings.transmission.is_noise_known
     quanta = (
         count_measured_quanta(settings, readings, light)
@@ -336,19 +335,17 @@ def show_step(name: str, before: np.ndarray, after: np.ndarray) -> tuple[str, np
     return name, lines(before), lines(after)
 
 
-def show_axis(
-    settings: config.ScanExperiment, y: np.ndarray, angles: np.ndarray | None, offset: float | None
-) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """A picture of a found axis of a parallel beam: half a turn of the middle row, then its mirror images about the axis.
+def show_axis(beam: ParallelBeam | ConeBeam, y: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """A picture of the axis of a parallel beam: half a turn of the middle row, then its mirror images about the axis.
 
     They continue the views if the axis is right. The picture before has the axis in the middle of the detector.
     """
-    if offset is None or angles is None or not isinstance(settings.scan, Parallel):
+    if not isinstance(beam, ParallelBeam):
         return []
-    row = y[np.abs(angles - angles[0]) < np.pi, y.shape[1] // 2]
+    row = y[np.abs(beam.angles - beam.angles[0]) < np.pi, y.shape[1] // 2]
     columns = np.arange(y.shape[2])
     middle = (y.shape[2] - 1) / 2
-    found = middle + offset / float(np.broadcast_to(settings.scan.pitch, (2,))[1])
+    found = middle + (beam.axis_offset - beam.detector_offset[1]) / beam.pitch[1]
 
     def mirror(column: float) -> np.ndarray:
         return np.stack([np.interp(2 * column - columns, columns, view, 0.0, 0.0) for view in row])
@@ -397,48 +394,55 @@ def correct_air(
         return normalise_air(transmission, columns), fit_air(transmission.value, columns), []
     air = (found or find_air(transmission)) if columns is None else None
     if air is None or not air.is_needed:
-        return transmission, None, []
+        return transmission, None, [] if air is None or air.is_believed else [_describe_doubtful_air(air)]
     least, most = air.factor.min(), air.factor.max()
     size = f"{most:.4g} +- {air.uncertainty:.2g}" if least == most else f"{least:.4g} to {most:.4g}"
     said = f"the air at both edges of the detector has {size} of the flats' light: views are divided by it (data.air = 0: not)"
     return air.normalise(transmission), air.factor[:, None, None], [said]
 
 
+def _describe_doubtful_air(air: Air) -> str:
+    return (
+        f"both edges of the detector have {air.factor.mean():.3g} of the flats' light, too far from 1 to be taken for air: the "
+        f"object is wider than the detector, or the flats have another exposure; data.air = {air.columns} divides by it"
+    )
+
+
 def resolve_axis(
-    settings: config.ScanExperiment, base: Path, y: np.ndarray, weights: np.ndarray, angles: np.ndarray
+    data: config.Readings, beam: ParallelBeam | ConeBeam, y: np.ndarray, weights: np.ndarray
 ) -> tuple[float | None, list[str]]:
     """Return the found ``axis_offset`` of a circular scan [length] or None, and notes.
 
-    An offset in the settings replaces the search, unless ``data.find_axis = true``.
+    A known offset of the beam replaces the search, unless ``data.find_axis = true``.
     """
-    search, known = settings.data.find_axis, settings.scan.axis_offset
-    if settings.scan.tilt and search is None:
-        return None, [f"the axis is tilted by {settings.scan.tilt:g} degrees: it is where scan.axis_offset has it, {known:g}"]
+    search, known = data.find_axis, beam.axis_offset + 0.0  # no -0
+    known_place = f"where {'the scan file' if isinstance(data, Nikon) else 'scan.axis_offset'} has it, {known:g}"
+    if beam.tilt and search is None:
+        return None, [f"the axis is tilted by {np.degrees(beam.tilt):g} degrees: it is {known_place}"]
     if search or (search is None and not known):
-        offset, note = find_rotation_axis(settings, base, y, weights, angles)
+        offset, note = find_rotation_axis(beam, y, weights, known_place)
         return offset, [note]
     if search is None:
-        return None, [f"the rotation axis is where scan.axis_offset has it, {known:g}: data.find_axis = true looks for it"]
+        return None, [f"the rotation axis is {known_place}: data.find_axis = true looks for it"]
     return None, []
 
 
 def find_rotation_axis(
-    settings: config.ScanExperiment, base: Path, y: np.ndarray, weights: np.ndarray, angles: np.ndarray
+    beam: ParallelBeam | ConeBeam, y: np.ndarray, weights: np.ndarray, known_place: str
 ) -> tuple[float | None, str]:
     """Return the ``axis_offset`` of a circular scan [length] and a note; None if a cone beam does not determine it.
 
     Raises:
         MivolError: as :func:`mivol.tomography.rotation_axis.find_axis`, for a parallel beam.
     """
-    if isinstance(settings.scan, Parallel):
-        axis = find_axis(y, weights, angles)
-        offset = axis.offset(y.shape[2], float(np.broadcast_to(settings.scan.pitch, (2,))[1]))
+    if isinstance(beam, ParallelBeam):
+        axis = find_axis(y, weights, beam.angles)
+        offset = axis.offset(y.shape[2], beam.pitch[1]) + beam.detector_offset[1]
     else:
-        beam = make_beam(settings, base, angles, y.shape[1:])
         try:
             axis = axis_from_fans(y, weights, beam)
         except MivolError as error:
-            return None, f"the rotation axis is where scan.axis_offset has it, {beam.axis_offset:g}: {error}"
+            return None, f"the rotation axis is {known_place}: {error}"
         offset = cone_axis_offset(axis, beam)
     return offset, f"rotation axis at column {axis.column:.2f} +- {axis.uncertainty:.2f} ({axis.method})"
 

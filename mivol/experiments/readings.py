@@ -9,7 +9,7 @@ displaced along v, a helix, or another trajectory breaks the symmetry.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -182,9 +182,11 @@ def check_unit(angles: np.ndarray, unit: str, way_out: str) -> None:
     """Refuse angles (views,) in another unit.
 
     Raises:
-        MivolError: more than 8 turns in radians, or at least 16 views within 6.3 degrees.
+        MivolError: more than 8 turns in radians, at least 16 views within 6.3 degrees, or several views at one angle.
     """
     span = float(np.ptp(angles))
+    if len(angles) > 1 and span == 0:
+        raise MivolError(f"all {len(angles)} views have the angle {angles[0]:g}: give the angles of the scan.")
     if unit == "radian" and span > 16 * np.pi:
         raise MivolError(
             f"the angles span {span:.4g} radians ({span / (2 * np.pi):.0f} turns): they seem to be degrees, {way_out}."
@@ -215,6 +217,8 @@ def read_nikon_scan(settings: config.ScanExperiment, base: Path, rows: slice) ->
     angles = read_nikon_angles(base / data.angles, len(scan.images)) if data.angles else scan.angles
     geometry = geometry_from_nikon(scan, angles)
     transmission = assume_quantum_noise(read_nikon_transmission(scan, data.saturation, rows))
+    if rows != ALL and isinstance(geometry, ConeBeam):
+        geometry = replace(geometry, detector=transmission.value.shape[1:])
     return ScanReadings(transmission, geometry=geometry, notes=tuple(describe_nikon_settings(scan, geometry)))
 
 

@@ -129,6 +129,10 @@ UNREAD: dict[str, tuple[Callable[[bytes], bool], str]] = {
     "a MATLAB file": (_starts_with(b"MATLAB"), "name it .mat"),
     "an HDF5 file": (_starts_with(hdf5.MAGIC), "name a volume .h5; explain and optimize find the data of a scan"),
     "a TIFF file": (tiff.is_tiff, "name it .tif, or the folder of a scan for explain and optimize"),
+    "a file of a Zeiss (Xradia) scanner": (
+        _starts_with(b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"),
+        "export projections, references and angles as TIFF and text, and name their folder",
+    ),
     ARCHIVE: (_starts_with(b"PK\x03\x04"), "unpack it, and name its folder"),
     FILM: (
         lambda head: (head[4:8] == b"ftyp" and head[8:11] != b"hei") or head.startswith((b"\x1aE\xdf\xa3", b"RIFF")),
@@ -334,13 +338,15 @@ VOLUME_SUFFIXES = tuple(suffix for suffix in FORMATS if suffix not in SHARED_SUF
 
 
 def is_volume(path: Path) -> bool:
-    """Whether a suffix belongs to volumes alone, a file of another suffix is DICOM or raw with a header, or a folder
-    holds DICOM or TIFF.
+    """Whether a suffix belongs to volumes alone, an ``.npy`` has three axes or more, a file of another suffix is DICOM or raw
+    with a header, or a folder holds DICOM or TIFF.
     """
     if path.is_dir():
         return zarr.is_zarr(path) or _is_dicom_folder(path) or bool(tiff.group_images(path))
     if path.name.lower().endswith(VOLUME_SUFFIXES) or _is_nameless_dicom(path):
         return True
+    if path.suffix.lower() == ".npy" and path.is_file():
+        return npy.count_axes(path) > 2
     return path.is_file() and not path.name.lower().endswith(tuple(FORMATS)) and raw.find_header(path) is not None
 
 

@@ -16,6 +16,7 @@ import struct
 import tokenize
 import zipfile
 import zlib
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -120,6 +121,13 @@ DAMAGE = (
     *(zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError, RuntimeError, UnicodeError, OSError),
 )
 """Errors of the parsers of ZIP files and array headers for foreign bytes."""
+
+
+def count_axes(path: Path) -> int:
+    """Number of axes of an array; 0 for a damaged or foreign file."""
+    with suppress(*DAMAGE), path.open("rb") as file:
+        return len(_read_array_header(file)[0])
+    return 0
 
 
 def read_archive(path: Path, only: str | None = None) -> dict[str, np.ndarray]:

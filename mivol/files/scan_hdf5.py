@@ -249,10 +249,15 @@ def _no_layout(file: Any, path: Path) -> MivolError:
 
 
 def _exchange(file: Any, path: Path, group: str, names: Mapping[str, str]) -> _Scan:
-    parts = {"data": "data", "flats": "data_white", "darks": "data_dark"}
-    frames = {r: Frames(_dataset(file, path, group, part), part) for r, part in parts.items() if r not in names}
-    angles = None if "angles" in names else Frames(_dataset(file, path, group, "theta"), "theta")
-    return _Scan("data-exchange", group, frames, angles)
+    parts = {"data": "data", "flats": "data_white", "darks": "data_dark", "angles": "theta"}
+    # Flats are needed, but their absence has a refusal of its own.
+    found = {
+        role: Frames(_dataset(file, path, group, part), part)
+        for role, part in parts.items()
+        if role not in names and (role == "data" or has_link(file, f"{group}/{part}"))
+    }
+    angles = found.pop("angles", None)
+    return _Scan("data-exchange", group, found, angles)
 
 
 def _nxtomo(file: Any, path: Path, entry: str, names: Mapping[str, str]) -> _Scan:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import glob
 import logging
+import os
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
@@ -242,8 +243,8 @@ class ImageGroup(NamedTuple):
         if len(self.files) == 1:
             return str(first)
         name, folder = glob.escape(first.name), first.parent
-        for number in ("*", "[0-9]*"):
-            pattern = re.sub(r"\d+", number, name)
+        begin = glob.escape(os.path.commonprefix([file.name for file in self.files]))  # noqa: RUF071, characters are meant
+        for pattern in (re.sub(r"\d+", "*", name), re.sub(r"\d+", "[0-9]*", name), f"{begin}*{first.suffix}"):
             if sorted(folder.glob(pattern)) == sorted(self.files):
                 return str(folder / pattern)
         raise refusal(folder, f"other images between {first.name} and its like", "one folder a kind", "move them apart")

@@ -243,13 +243,15 @@ class Air:
         factor: (views,) mean over rows and columns; one number for all views if they differ by no more than noise.
         columns: columns at each edge.
         uncertainty: standard deviation of the mean factor.
-        is_needed: whether the factor differs from 1, or between views, by more than noise and a hundredth.
+        is_needed: whether the factor is believed, and differs from 1, or between views, by more than noise and a hundredth.
+        is_believed: whether the mean factor is in ``AIR_RANGE``.
     """
 
     factor: np.ndarray
     columns: int
     uncertainty: float
     is_needed: bool
+    is_believed: bool = True
 
     def normalise(self, transmission: Transmission) -> Transmission:
         """Divide each view by its factor."""
@@ -270,7 +272,7 @@ def find_air(transmission: Transmission) -> Air | None:
     The outer columns count as air if they are as bright at both edges in each view, do not rise or fall towards the middle, and
     if the sum of the line integrals over the detector, which is the mass of the object, is the same in all views. An object
     that reaches beyond the detector fails at least one of the three, unless it is round and much wider than the detector, when
-    ``AIR_RANGE`` excludes it.
+    ``AIR_RANGE`` keeps it from being believed.
 
     Returns:
         The air, or None if the edges are not air.
@@ -291,8 +293,9 @@ def find_air(transmission: Transmission) -> Air | None:
         profile = np.nanmean(log - means.mean(0)[:, None], axis=0)
         mass = -np.nansum(log - means.mean(0)[:, None], axis=1)
     air = means.mean()
-    if not np.isfinite([air, noise, mass.sum()]).all() or not AIR_RANGE[0] < np.exp(air) < AIR_RANGE[1]:
+    if not np.isfinite([air, noise, mass.sum()]).all():
         return None
+    is_believed = bool(AIR_RANGE[0] < np.exp(air) < AIR_RANGE[1])
     at_edges = noise / np.sqrt(width)
     falls = [abs(np.nanmean(side[: width // 2]) - np.nanmean(side[width // 2 : width])) for side in (profile, profile[::-1])]
     between = np.std(means[0] - means[1])
@@ -307,8 +310,8 @@ def find_air(transmission: Transmission) -> Air | None:
     drifts = over_views > 3 * at_edges / np.sqrt(2) + AIR_TOLERANCE / 2
     factor = np.exp(means.mean(0)) if drifts else np.full(views, np.exp(air))
     sigma = float(np.exp(air) * noise / np.sqrt(2 * views * width))
-    is_needed = drifts or abs(air) > AIR_TOLERANCE + 5 * sigma
-    return Air(factor, min(*sides, columns // 8), sigma, bool(is_needed))
+    is_needed = is_believed and (drifts or abs(air) > AIR_TOLERANCE + 5 * sigma)
+    return Air(factor, min(*sides, columns // 8), sigma, bool(is_needed), is_believed)
 
 
 def to_line_integrals(transmission: Transmission, n_sigma: float = 3.0) -> tuple[np.ndarray, np.ndarray]:

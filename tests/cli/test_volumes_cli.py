@@ -32,6 +32,14 @@ def test_explain_describes_a_volume(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "1 values are below 0" in text and "1 values are NaN or Inf" in text
 
 
+def test_an_array_of_three_axes_is_a_volume(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """And one of two axes a cloud of points."""
+    np.save(tmp_path / "a.npy", np.ones((2, 3, 3), np.float32))
+    assert run("explain", tmp_path / "a.npy") == 0 and "voxels (x, y, z): 3 x 3 x 2" in capsys.readouterr().out
+    np.save(tmp_path / "a.npy", np.ones((2, 3), np.float32))
+    assert run("explain", tmp_path / "a.npy") == 0 and "2 points" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("suffix", [".vdb", ".nvdb"])
 def test_verbs_take_a_file_of_several_grids(tmp_path: Path, capsys: pytest.CaptureFixture, suffix: str) -> None:
     """Each grid is described, and kept in another file of grids; a picture needs the name of one."""
@@ -192,6 +200,7 @@ def test_a_file_that_is_no_volume_lists_the_formats(tmp_path: Path, capsys: pyte
         ("a.map3", bytes(208) + b"MAP " + bytes(812), "an MRC file", "name it .mrc"),
         ("a.m5", b"MATLAB 5.0 MAT-file", "a MATLAB file", "name it .mat"),
         ("a.lsm", b"II*\0" + bytes(8), "a TIFF file", "name it .tif"),
+        ("a.txrm", bytes.fromhex("d0cf11e0a1b11ae1") + bytes(8), "a file of a Zeiss (Xradia) scanner", "as TIFF and text"),
         ("a.raw", bytes(64), "raw bytes", ".nhdr or .mhd"),
     ],
 )

@@ -90,7 +90,7 @@ def test_distances_that_are_assumed(tmp_path: Path) -> None:
         ({"PositionerPrimaryAngleIncrement": [0.0, 1.0]}, "2 numbers of PositionerPrimaryAngleIncrement.*5 frames"),
         ({"PixelIntensityRelationship": "LOG"}, "PixelIntensityRelationship LOG, expected values in proportion"),
         ({"PixelIntensityRelationshipSign": -1}, "PixelIntensityRelationship LIN, falling with the light"),
-        ({"RescaleSlope": 0.0}, "readings of at most 0, expected light"),
+        ({"RescaleSlope": 0.0}, "readings from 0 to 0, expected light"),
     ],
 )
 def test_a_header_that_lacks_a_fact_is_refused(tmp_path: Path, more: dict[str, object], found: str) -> None:

@@ -12,6 +12,7 @@ from sound_files import his_bytes
 
 from mivol.cli import main
 from mivol.errors import MivolError
+from mivol.experiments.found_scan import draft_scan
 from mivol.files import image_stack, read_volume, write_volume
 from mivol.files.image_stack import read_stack, stack_shape
 from mivol.files.mrc import read_tilt_angles
@@ -153,6 +154,22 @@ def test_a_tilt_series_becomes_a_volume(variant_rgb: str, tmp_path: Path) -> Non
     flags = ["-o", str(tmp_path / "run"), "--set", "solve.iterations=3", "--set", "held_out_every=0"]
     assert main(["optimize", str(tmp_path / "series.mrc"), *flags]) == 0
     assert read_volume(tmp_path / "run/volumes/reconstruction.npz").values.shape == (12, 32, 32, 1)
+
+
+def test_a_tilt_series_without_air_or_without_angles(tmp_path: Path, capsys) -> None:
+    """The brightest of 60 to 100 counts is the light. Without angles the sentence names their file. A folder holds a series."""
+    mrcfile = pytest.importorskip("mrcfile")
+    with mrcfile.new(tmp_path / "thin.st") as file:
+        file.set_data((60 + 40 * np.random.default_rng(3).random((20, 4, 32))).astype(np.float32))
+    assert main(["explain", str(tmp_path / "thin.st")]) == 0
+    assert "a tilt series has a file thin.rawtlt or thin.tlt or thin.mdoc beside it" in capsys.readouterr().out
+    assert main(["optimize", str(tmp_path / "thin.st")]) == 1
+    assert "found a volume, for want of angles" in capsys.readouterr().err
+    (tmp_path / "thin.tlt").write_text("\n".join(map(str, range(-40, 60, 5))))
+    draft = draft_scan(tmp_path)
+    assert draft.raw["data"]["reading"] == "intensity" and 99 < draft.raw["data"]["light"] <= 100
+    assert draft.lines[0] == f"found: thin.st in {tmp_path}"
+    assert draft_scan(tmp_path, ["data.reading=line_integral"]).raw["data"]["reading"] == "line_integral"
 
 
 def test_a_folder_of_edf_is_a_scan(tmp_path: Path, capsys) -> None:

@@ -11,11 +11,12 @@ from PIL import Image
 from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments import projections
+from mivol.experiments import projections, readings
 from mivol.files import read_volume
 from mivol.files.nikon import read_nikon, read_nikon_angles, read_nikon_transmission
 from mivol.tomography.geometry import ConeBeam, VoxelGrid
 from mivol.tomography.panel_views import geometry_from_nikon
+from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.projector import Projector
 
 VIEWS, ROWS, COLUMNS, WHITE = 16, 10, 12, 60000.0
@@ -153,7 +154,27 @@ def test_angles_are_read_from_a_list(variant_rgb, tmp_path: Path, name: str) -> 
     chosen = config.load(tmp_path / "fit.toml", [f'data.angles="{name}"'])
     data = projections.make_data(chosen, tmp_path, projections.make_grid(chosen, tmp_path))
     np.testing.assert_allclose(data.geometry.angles, np.radians(angles - 180), atol=1e-14)
-    assert data.notes == ("ignored settings: DetectorOffsetX = 2",)
+    assert data.notes[0] == "ignored settings: DetectorOffsetX = 2"
+    # An even image has no axis.
+    assert "the rotation axis is where the scan file has it, 0: found no structure" in data.notes[1]
+
+
+def test_an_axis_that_the_settings_leave_at_0_is_found(tmp_path: Path) -> None:
+    """Computed readings of a head 0.5 mm beside the axis's place in the file; some rows give the same axis as all of them."""
+    beam = ConeBeam(np.arange(90) * np.pi / 45, (6, 48), 20.0, 50.0, (0.6, 0.5), axis_offset=0.5)
+    counts = np.round(WHITE * np.exp(-0.2 * shepp_logan(half_width=4.0).project(beam)))
+    changes = {"DetectorPixelsX": 48, "DetectorPixelsY": 6, "Projections": 90, "AngularStep": 4}
+    write_scan(tmp_path, counts[:, ::-1, ::-1], **changes)
+    (tmp_path / "fit.toml").write_text(TOML)
+    chosen = config.load(tmp_path / "fit.toml")
+    for rows, height in ((readings.ALL, 6), (slice(1, 5), 4)):
+        data = projections.read_measured(chosen, tmp_path, rows)
+        assert data.geometry.detector == (height, 48) and "rotation axis at column" in data.notes[0]
+        assert abs(data.geometry.axis_offset - 0.5) < 0.2 * 0.5 * 20 / 50  # 0.2 columns
+    write_scan(tmp_path, counts[:, ::-1, ::-1], ObjectOffsetX=-0.4, **changes)
+    data = projections.read_measured(chosen, tmp_path)
+    assert data.geometry.axis_offset == 0.4
+    assert data.notes == ("the rotation axis is where the scan file has it, 0.4: data.find_axis = true looks for it",)
 
 
 REFUSED = {

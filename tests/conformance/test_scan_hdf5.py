@@ -12,7 +12,7 @@ from beamline_files import DARKS, DEGREES, FLATS, FRAMES, KEY, VIEWS, write_name
 
 from mivol.errors import MivolError
 from mivol.files import read_projections
-from mivol.files.scan_hdf5 import half_turns_in_radians, is_scan
+from mivol.files.scan_hdf5 import NO_DARKS, half_turns_in_radians, is_scan
 
 
 @pytest.mark.parametrize("name", ["a.nxs", "a.hdf", "a.he5", "a.h5", "a.hdf5", "a"])
@@ -51,6 +51,19 @@ def test_the_first_of_several_scans_is_read(tmp_path: Path) -> None:
     assert read_projections(path, "entry1/tomo_entry").angles[0] == 0
     with pytest.raises(MivolError, match=r"no dataset nowhere/data \(present: entry0000, entry1\)"):
         read_projections(path, "nowhere")
+
+
+def test_darks_and_angles_of_data_exchange_may_be_missing(tmp_path: Path) -> None:
+    """Without darks 0 is no light, without angles the arc is the settings'; flats are needed."""
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file["exchange/data"], file["exchange/data_white"] = FRAMES[VIEWS], FRAMES[FLATS]
+    scan = read_projections(path)
+    assert scan.angles is None and not scan.darks.any() and scan.notes == (NO_DARKS,)
+    with h5py.File(path, "a") as file:
+        del file["exchange/data_white"]
+    with pytest.raises(MivolError, match="no flat"):
+        read_projections(path)
 
 
 def test_datasets_by_name(tmp_path: Path) -> None:

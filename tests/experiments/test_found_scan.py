@@ -116,6 +116,34 @@ def test_names_that_no_pattern_tells_apart(tmp_path: Path) -> None:
     assert group.pattern() == f"{tmp_path}/a_[0-9]*.tif"
 
 
+def test_flats_before_and_after_the_views_count_together(tmp_path: Path) -> None:
+    """One pattern finds both; where it would find other images as well, the larger group is taken, and the other is named."""
+    folder = write_tiffs(tmp_path / "scan")
+    for file in folder.glob("flat_*"):
+        file.rename(folder / file.name.replace("flat_", "I0_before_"))
+        Image.fromarray(FLATS[0].astype("u2")).save(folder / file.name.replace("flat_", "I0_after_"))
+    draft = draft_scan(folder)
+    assert draft.raw["data"]["flats"] == f"{folder}/I0_*.tif"
+    assert "found: I#_after_#.tif, I#_before_#.tif: 4 flats" in draft.lines
+    (folder / "I0_after_0001.tif").rename(folder / "white_0001.tif")
+    draft = draft_scan(folder)
+    assert draft.raw["data"]["flats"] == f"{folder}/I*_before_*.tif"
+    assert any("I#_after_#.tif, white_#.tif: not used" in line for line in draft.lines)
+
+
+def test_a_file_of_pages_is_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Flats and darks beside it count if their images are as large; explain takes it for a volume without --set."""
+    tifffile = pytest.importorskip("tifffile")
+    images = write_tiffs(tmp_path / "scan")
+    views = np.stack([np.asarray(Image.open(file)) for file in sorted(images.glob("scan12_*"))])
+    for name, pages in (("views", views), ("flats", FLATS.astype("u2")), ("dark", np.zeros((2, 3, 4), "u2"))):
+        tifffile.imwrite(tmp_path / f"{name}.tif", pages, photometric="minisblack")
+    data = draft_scan(tmp_path / "views.tif").raw["data"]
+    assert data["file"] == str(tmp_path / "views.tif") and data["flats"] == str(tmp_path / "flats.tif") and "darks" not in data
+    assert main(["explain", str(tmp_path / "views.tif")]) == 0
+    assert "mivol optimize takes it as a scan" in capsys.readouterr().out
+
+
 BLOCKS = {"unlike": ((1, 12, 0), (2, 9, 2)), "even at first": ((1, 12, np.pi / 2), (1, 12, -np.pi / 2), (1, 6, np.pi / 2))}
 
 

@@ -17,6 +17,7 @@ from mivol.experiments.readings import ScanReadings, note_order, to_radians
 from mivol.experiments.scan_corrections import is_cut_off
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts
 from mivol.tomography.geometry import ConeBeam, ParallelBeam
+from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.preprocess import Air, Quanta, Transmission
 from mivol.tomography.rotation_axis import Axis
 
@@ -141,14 +142,33 @@ def test_mirror_images_continue_the_views_about_the_found_axis() -> None:
     """A disc beside the axis: the first mirror image equals the view before it, as the view half a turn later would."""
     angles, columns = np.arange(12) * np.pi / 6, np.arange(40)
     y = np.exp(-(((columns - 23.0 - 6 * np.cos(angles)[:, None]) / 3) ** 2))[:, None]
-    settings = SimpleNamespace(scan=Parallel(pitch=(1.0, 0.5)))
-    ((name, before, after),) = projections.show_axis(settings, y, angles, (23 - 19.5) * 0.5)
+    beam = ParallelBeam(angles, (1, 40), (1.0, 0.5), axis_offset=(23 - 19.5) * 0.5 + 2, detector_offset=(0, 2))
+    ((name, before, after),) = projections.show_axis(beam, y)
     assert name == "axis" and before.shape == after.shape == (12, 40)
     # Beyond the first column the disc has exp(-(11 / 3)^2) = 1.45e-6.
     np.testing.assert_allclose(after, y[:, 0], atol=1.5e-6)
     assert np.abs(before - y[:, 0]).max() > 0.5
-    assert projections.show_axis(settings, y, angles, None) == []
-    assert projections.show_axis(SimpleNamespace(scan=Cone(source_to_axis=1, source_to_detector=2)), y, angles, 1.0) == []
+    assert projections.show_axis(ConeBeam(angles, (1, 40), 1, 2), y) == []
+
+
+def test_the_found_axis_of_a_displaced_detector(tmp_path: Path) -> None:
+    """The same readings and another place of the detector: the axis is displaced as much."""
+    head = shepp_logan(half_width=12.0)
+    beam = ParallelBeam(np.arange(48) * np.pi / 48, (1, 40), axis_offset=1.3)
+    np.save(tmp_path / "y.npy", 0.05 * head.project(beam).astype("f4"))
+    data = {"source": "stack", "file": str(tmp_path / "y.npy"), "reading": "line_integral"}
+    found = [
+        projections.read_measured(
+            config.from_dict({"title": "a", "scan": {"beam": "parallel", "detector_offset": [0.0, d]}, "data": data}), Path()
+        ).geometry.axis_offset
+        for d in (0.0, 5.0)
+    ]
+    assert abs(found[0] - 1.3) < 0.2 and abs(found[1] - found[0] - 5) < 1e-9
+
+
+def test_views_at_one_angle_are_no_radians() -> None:
+    with pytest.raises(MivolError, match="all 20 views have the angle 0: give the angles"):
+        readings.check_unit(np.zeros(20), "degree", "set angle_unit")
 
 
 def test_voxels_that_hold_what_the_detector_sees() -> None:
@@ -174,6 +194,9 @@ def test_air_is_looked_for_unless_the_settings_say(monkeypatch: pytest.MonkeyPat
     assert projections.correct_air(light, 0) == (light, None, [])
     air = replace(air, is_needed=False)
     assert projections.correct_air(light, None) == (light, None, [])
+    air = replace(air, is_believed=False)
+    assert "have 0.5 of the flats' light, too far from 1" in (found := projections.correct_air(light, None))[2][0]
+    assert found[:2] == (light, None) and "data.air = 4 divides by it" in found[2][0]
     air = replace(air, is_needed=True, factor=np.array([0.5, 0.6]))
     assert "has 0.5 to 0.6 of" in projections.correct_air(light, None)[2][0]
 
