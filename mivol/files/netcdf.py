@@ -4,7 +4,7 @@ NetCDF-4 is HDF5, read through h5py; the classic format and its 64-bit offsets a
 
 Conventions (CF). A dimension is an axis by the attribute ``axis`` or ``standard_name`` of its coordinate, or by its name; else
 the last three dimensions are (z, y, x). Coordinates are the centres of voxels, in metres or in a unit that is converted to
-metres. A descending axis is turned around. Uneven steps, as of stretched levels, become even steps of the smallest one: a new
+metres; values per length, such as extinctions, become values per metre with them. A descending axis is turned around. Uneven steps, as of stretched levels, become even steps of the smallest one: a new
 voxel is the mean of the overlapped voxels, so integrals along the axis are kept. ``name[3]`` is entry 3 of the dimension
 before the axes.
 
@@ -42,6 +42,9 @@ AXES = {
 """axis -> names of its dimension or values of ``standard_name``; a name may go on after "_"."""
 
 METRES = {"m": 1.0, "meter": 1.0, "metre": 1.0, "km": 1e3, "kilometer": 1e3, "kilometre": 1e3, "cm": 1e-2, "mm": 1e-3}
+
+PER_LENGTH = re.compile(r"(?:1 ?)?/ ?([A-Za-z]+)|([A-Za-z]+) ?(?:\^|\*\*)? ?\{?-1\}?")
+"""Units of extinctions: 1/km, km-1, km^-1, km**-1."""
 
 MOST_STEPS = 1 << 14
 """Most even steps along an axis: a damaged coordinate asks for any number."""
@@ -114,6 +117,9 @@ def read_netcdf(path: Path, dataset: str | None = None) -> VolumeData:
     stored, rest = str(array.dtype), sorted(axes.values())
     array = np.transpose(array, [rest.index(axes[axis]) for axis in "zyx"])
     array, to_world, notes = _place(path, array, place, notes, "km" if has_water else "m")
+    per_metre = _find_per_metre(held) if name in grids and place[0] is not None else 1.0
+    if per_metre != 1:
+        array, notes = array * per_metre, [*notes, f"values in {held.attributes['units']} became values in 1/m."]
     meta = {
         "path": str(path), "format": "netcdf", "dtype": stored, "space": None, "dataset": dataset or name,
         "unit": "m" if place[0] is not None else "voxel", "notes": tuple(notes),
@@ -278,6 +284,14 @@ def _unit(held: Variable) -> str:
     """The unit of a variable, in the singular."""
     unit = str(held.attributes.get("units", "")).strip().lower()
     return unit[:-1] if unit.endswith("s") and unit[:-1] in METRES else unit
+
+
+def _find_per_metre(held: Variable) -> float:
+    """The factor that makes values per metre of values per another length; 1 for values of another kind."""
+    found = PER_LENGTH.fullmatch(str(held.attributes.get("units", "")).strip())
+    unit = (found[1] or found[2]) if found else ""
+    # Mm is a megametre, as in extinctions of aerosols; its small letters would be a millimetre.
+    return 1e-6 if unit == "Mm" else 1 / METRES.get(unit.lower(), 1.0)
 
 
 def _place(

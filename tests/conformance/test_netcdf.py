@@ -98,6 +98,29 @@ def test_units_of_lengths_and_descending_axes(tmp_path: Path, write: Callable) -
     np.testing.assert_allclose(volume.to_world[:3, 3], 0, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("units", "factor"),
+    [
+        ("km-1", 1e-3),
+        ("1/km", 1e-3),
+        ("km^-1", 1e-3),
+        ("Mm-1", 1e-6),
+        ("mm-1", 1e3),
+        ("/cm", 100.0),
+        ("m-1", 1.0),
+        ("kg-1", 1.0),
+    ],
+)
+def test_values_per_length_become_values_per_metre(tmp_path: Path, units: str, factor: float) -> None:
+    """As their coordinates do, so that optical depths stay; voxels without coordinates keep their values."""
+    write_classic(tmp_path / "a.nc", model(ql=(("z", "y", "x"), VALUES, {"units": units})))
+    volume = read_volume(tmp_path / "a.nc")
+    np.testing.assert_allclose(volume.values[..., 0], VALUES * factor, rtol=2**-23)
+    assert volume.meta["notes"] == ((f"values in {units} became values in 1/m.",) if factor != 1 else ())
+    write_classic(tmp_path / "b.nc", {"ql": (("z", "y", "x"), VALUES, {"units": units})})
+    np.testing.assert_array_equal(read_volume(tmp_path / "b.nc").values[..., 0], VALUES)
+
+
 def test_one_of_several_times(tmp_path: Path, write: Callable) -> None:
     both = np.stack([VALUES, 2 * VALUES])
     write(tmp_path / "a.nc", model(ql=(("time", "z", "y", "x"), both, {}), time=(("time",), np.array([0.0, 60.0]), {})))
