@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
@@ -34,7 +35,7 @@ from mivol.cli.inputs import draft_scan_of, explain, load_experiment, load_named
 from mivol.errors import MivolError
 from mivol.optim.interrupt import Signals
 
-USAGE, STOPPED = 2, 130
+USAGE, STOPPED, UNREAD = 2, 130, 141
 
 DESCRIPTION = """Differentiable and inverse volume rendering on Mitsuba 3. "mivol doctor" checks whether this machine can
 render. "mivol demo" lists examples. "mivol VERB --help" explains a verb."""
@@ -44,13 +45,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run ``mivol`` with these arguments (default: the arguments of the process).
 
     Returns:
-        Exit code: 0 for success, 1 for a refusal, 2 for wrong arguments, 130 for Ctrl-C and SIGTERM; ``validate`` has more.
+        Exit code: 0 for success, 1 for a refusal, 2 for wrong arguments, 130 for Ctrl-C and SIGTERM, 141 if nobody
+        reads the output any more; ``validate`` has more.
     """
     signals = Signals()
     try:
-        arguments = parse(list(sys.argv[1:] if argv is None else argv))
-        return arguments.verb(arguments) or 0
+        try:
+            arguments = parse(list(sys.argv[1:] if argv is None else argv))
+            return arguments.verb(arguments) or 0
+        finally:
+            sys.stdout.flush()
     except BaseException as error:
+        if isinstance(error, BrokenPipeError) and _is_output_closed():
+            return UNREAD
         if signals.are_behind(error):
             print("mivol: stopped; finished work is kept.", file=sys.stderr)
             return STOPPED
@@ -58,6 +65,17 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         print(f"mivol: {describe_error(error)}", file=sys.stderr)
         return 1
+
+
+def _is_output_closed() -> bool:
+    """Whether the reader of the output has gone, as in ``mivol explain scene.xml | head``; then the output goes nowhere."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Python flushes once more at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
 
 
 def describe_error(error: MivolError | OSError | MemoryError) -> str:

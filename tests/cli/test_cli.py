@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 
 import drjit as dr
@@ -10,7 +12,7 @@ import numpy as np
 import pytest
 from tiny_experiment import PHOTOS, SCENE, refused, run, write_experiment
 
-from mivol.cli import VERBS, describe_error, load_named_scene, parse
+from mivol.cli import VERBS, describe_error, load_named_scene, main, parse
 from mivol.errors import MivolError
 from mivol.files import read_exr
 
@@ -205,6 +207,16 @@ def test_wrong_arguments_end_with_2(capsys: pytest.CaptureFixture) -> None:
         with pytest.raises(SystemExit) as done:
             run(*arguments)
         assert done.value.code == 2
+
+
+def test_a_reader_that_has_gone_ends_quietly(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in ``mivol bench | head -1``: no message and no traceback, also when Python flushes the output at its end."""
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as output:
+        monkeypatch.setattr(sys, "stdout", output)
+        assert main(["bench"]) == 141
+    assert capsys.readouterr().err == ""
 
 
 def test_verbs_are_short() -> None:
