@@ -10,6 +10,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 
@@ -23,6 +24,13 @@ def traverse(node: mi.Object) -> mi.SceneParameters:
 def list_values(params: mi.SceneParameters) -> list[tuple[str, Any]]:
     """The keys and values of parameters: the pairs of ``list(params)``."""
     return [(key, params[key]) for key in params.keys()]  # noqa: SIM118  (iteration gives pairs, and defines a class)
+
+
+def put_value(params: mi.SceneParameters, key: str, value: Any) -> None:
+    """Set a parameter that does not hold the very same arrays. For the same arrays ``params[key] = value`` changes nothing,
+    but first waits for all kernels and compares the numbers."""
+    if dr.detail.collect_indices(params[key]) != dr.detail.collect_indices(value):
+        params[key] = value
 
 
 def find_children(node: mi.Object) -> dict[str, mi.Object]:

@@ -62,7 +62,7 @@ from mivol.transport.estimators.lighting.tabulated_shadows import TransmittanceG
 from mivol.transport.estimators.single_scattering.near_light import NearLighting
 from mivol.transport.estimators.single_scattering.single_scattering import PROBE_DEPTH
 from mivol.transport.estimators.single_scattering.visibility_cache import VisibilityCache, build_visibility_cache
-from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
+from mivol.transport.media.grid_integral import gradient_bytes, packs_gradient
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import (
     SEGMENT_ESTIMATORS,
@@ -287,10 +287,9 @@ def _plan_gradient_memory(needs: Needs) -> tuple[int, Choice]:
                 memory += 8 * VOXELS * bricks * channels
                 ways.add("added to the stored nodes")
                 continue
-            packed = gradient_bytes((z, y, x), channels)
-            fits = needs.variant.startswith("llvm") and packed <= PACKED_LIMIT
-            memory += (packed if fits else 0) + 8 * z * y * x * channels
-            ways.add("packed corners, one copy per thread" if fits else "added to the nodes")
+            packs = needs.variant.startswith("llvm") and packs_gradient((z, y, x), channels, needs.film_samples)
+            memory += (gradient_bytes((z, y, x), channels) if packs else 0) + 8 * z * y * x * channels
+            ways.add("packed corners, one copy per thread" if packs else "added to the nodes")
     # Asking for the free memory takes as long as all other choices: a small step is not asked about.
     asks = needs.parameters and memory > SMALL_STEP
     free = free_memory() if asks else None

@@ -49,7 +49,7 @@ from mivol.scene.scene_state import SceneState, find_gradient_array
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.stand_in import StandIn, reset_sampler
 from mivol.scene.survey import SceneSurvey, survey_scene
-from mivol.scene_graph import list_values, traverse
+from mivol.scene_graph import list_values, put_value, traverse
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.line_integrals.aovs import integrate_aovs
 from mivol.transport.media.medium_view import MediumView, traverse_medium
@@ -358,13 +358,13 @@ class _DifferentiatedParameter:
 
     def assign(self, value: Any) -> None:
         """Set the parameter, and compute all derived values from the new value."""
-        self.params[self.key] = value
+        put_value(self.params, self.key, value)
         self.params.set_dirty(self.key)
         self.params.update()
 
     def restore(self) -> None:
         """Restore the original value without an update."""
-        self.params[self.key] = self.value
+        put_value(self.params, self.key, self.value)
 
 
 def recompute_derived(scene: mi.Scene) -> None:

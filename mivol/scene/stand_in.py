@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 from weakref import WeakValueDictionary
 
@@ -73,8 +74,40 @@ def _has_no_image(film: mi.Film) -> bool:
         return True
 
 
+MAX_LENSES = 256
+"""Most cameras whose lens is remembered: the host waits for all kernels before it reads numbers of a lens."""
+
+MAX_CAMERAS = 256
+"""Most cameras whose numbers a stand-in keeps."""
+
 MET_PIXELS = 1 << 22
 """Most pixels of films that get an image before their first render."""
+
+
+@dataclass(frozen=True)
+class _CameraCopy:
+    """The numbers of a camera, in arrays of their own: shared arrays would tell the cameras apart.
+
+    Attributes:
+        lens: all numbers but the place.
+        arrays: the parameters that are arrays, by name, without the place.
+        matrices: matrix and inverse transpose of the place.
+        held: the arrays of the camera. Dr.Jit would give the index of a freed array to another array.
+    """
+
+    lens: list[float]
+    arrays: dict[str, mi.Float]
+    matrices: list[mi.Matrix4f]
+    held: list[Any]
+
+    @classmethod
+    def of(cls, numbers: list[float], names: Sequence[str], held: list[Any]) -> _CameraCopy:
+        """Copy a camera: ``NUMBERS``, and arrays of these names followed by the two matrices."""
+        is_own = dr.opaque(mi.Bool, True)
+        arrays = {name: dr.select(is_own, array, 0) for name, array in zip(names, held[:-2], strict=True)}
+        matrices = [dr.unravel(type(matrix), dr.select(is_own, dr.ravel(matrix), 0)) for matrix in held[-2:]]
+        dr.eval(arrays, matrices)
+        return cls([*numbers, *(float(array[0]) for array in arrays.values())], arrays, matrices, held)
 
 
 class StandIn:
@@ -121,32 +154,33 @@ class StandIn:
             opened, closed = sensor.shutter_open(), sensor.shutter_open() + sensor.shutter_open_time()
             parts |= {"shutter_open": opened, "shutter_close": closed, "on_lens": sensor.needs_aperture_sample()}
             self.camera = mi.load_dict({"type": "mivol_copied_camera", **parts}, parallel=False)
-        self._shown: tuple[list[Any], list[Any]] | None = None
+        self._shown: tuple | None = None
+        self._lens: list[float] | None = None
+        self._copies: dict[tuple, _CameraCopy] = {}
         self._met: set[int] = set()
 
     def show(self, sensor: mi.Sensor) -> None:
         """Take the numbers of a camera of the kind."""
         given = traverse(sensor)
-        numbers, matrix = [given[name] for name in NUMBERS], given["to_world"].matrix
-        arrays = {name: dr.detach(given[name]) for name in ARRAYS[sensor.class_name()]}
-        state = [*numbers, *(array.index for array in arrays.values()), *dr.detail.collect_indices(matrix)]
-        if self._shown is not None and self._shown[0] == state:
+        numbers, names = [given[name] for name in NUMBERS], ARRAYS[sensor.class_name()]
+        arrays = [*(given[name] for name in names), given["to_world"].matrix, given["to_world"].inverse_transpose]
+        key = (*numbers, *dr.detail.collect_indices(arrays))
+        if key == self._shown:
             return
-        # Arrays of its own: shared arrays would tell the cameras apart.
-        is_own = dr.opaque(mi.Bool, True)
-        copies = {name: dr.select(is_own, array, 0) for name, array in arrays.items()}
-        to_world = dr.unravel(type(matrix), dr.select(is_own, dr.ravel(dr.detach(matrix)), 0))
-        if self._is_found:
-            for name, number in zip(NUMBERS, numbers, strict=True):
-                self._params[name] = number
-            for name, array in copies.items():
-                self._params[name] = array
-            self._params["to_world"] = type(given["to_world"])(to_world)
-            self._params.update()
+        if key not in self._copies:
+            self._copies = dict(list(self._copies.items())[1 - MAX_CAMERAS :])
+            self._copies[key] = _CameraCopy.of(numbers, names, dr.detach(arrays))
+        copy = self._copies[key]
+        if not self._is_found:
+            self.camera.take(copy.matrices[0], *(dr.opaque(mi.Float, number) for number in numbers[:2]), **copy.arrays)
         else:
-            self.camera.take(to_world, *(dr.opaque(mi.Float, number) for number in numbers[:2]), **copies)
-        # Held: Dr.Jit would give the index of a freed array to another array.
-        self._shown = state, [*arrays.values(), matrix]
+            self._params["to_world"] = type(given["to_world"])(*copy.matrices)
+            # An update makes 115 launches, and waits for each of 79 numbers.
+            if copy.lens != self._lens:
+                for name, value in (dict(zip(NUMBERS, numbers, strict=True)) | copy.arrays).items():
+                    self._params[name] = value
+                self._params.update()
+        self._shown, self._lens = key, copy.lens
 
     def meet(self, sensor: mi.Sensor, others: Sequence[mi.Sensor], names: list[str]) -> None:
         """Give the films of cameras an image, if they have none, and their samplers numbers: both would come with a render.

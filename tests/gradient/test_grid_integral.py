@@ -13,8 +13,23 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from oracle import tau_gradient_twin
+from scattering_scenes import PLACE, close_up, mivol
 
-from scenes import FRAMES, as_float32, from_lanes, make_lattice, random_rays, tau_and_row, tau_fast, tensor, to_lanes
+from scenes import (
+    FRAMES,
+    as_float32,
+    box_of,
+    from_lanes,
+    grid_volume,
+    make_lattice,
+    medium,
+    random_rays,
+    sky,
+    tau_and_row,
+    tau_fast,
+    tensor,
+    to_lanes,
+)
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -191,13 +206,43 @@ def test_other_channel_counts_are_refused(channels):
         tau_fast(np.ones((2, 2, 2, channels)), np.eye(4), [0, 0, 0], [0, 0, 1])
 
 
-@pytest.mark.parametrize("spare", [-1, 0])
-def test_gradients_are_packed_up_to_a_size(variant_rgb, monkeypatch, spare):
-    """Packed gradients hold the 8 corners of a cell side by side; larger gradients hold a number a node, on every back end."""
+@pytest.mark.parametrize(("spare", "rays"), [(-1, 5), (0, 5), (0, 3)])
+def test_gradients_are_packed_up_to_a_size(variant_rgb, monkeypatch, spare, rays):
+    """Packed gradients hold the 8 corners of a cell side by side; larger gradients, and gradients of few rays, hold a number a
+    node, on every back end. A face has (4 5 6)^(2/3) = 24.3 cells.
+    """
     from mivol.transport.media import grid_integral
 
     lattice = make_lattice(np.ones((3, 4, 5, 2), np.float32), FRAMES["unit"], False)
     monkeypatch.setattr(grid_integral, "PACKED_LIMIT", grid_integral.gradient_bytes(lattice.res, 2) + spare)
-    found = grid_integral.NodeGradient.zeros(lattice)
-    packed = spare == 0 and "llvm" in variant_rgb
+    monkeypatch.setattr(grid_integral, "FEW_RAYS", 4 / 24.3)
+    found = grid_integral.NodeGradient.zeros(lattice, rays)
+    packed = spare == 0 and rays == 5 and "llvm" in variant_rgb
     assert (found.packed, dr.width(found.buffer)) == (packed, 8 * 4 * 5 * 6 * 2 if packed else 3 * 4 * 5 * 2)
+
+
+@pytest.mark.parametrize(("spp", "packs"), [(1, False), (2, True)])
+def test_the_rays_of_a_render_choose_how_a_gradient_is_added(cpu_back_end, monkeypatch, spp, packs):
+    """A face of 9^2 cells has few rays up to 10.1, and a film of 3^2 pixels has 9 for each sample. Both ways agree."""
+    from mivol.transport.media import grid_integral
+
+    values = np.random.default_rng(3).uniform(0, 3, (8, 8, 8, 1)).astype(np.float32)
+    smoke = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.8)
+    scene, key = close_up({"smoke": box_of(smoke, PLACE), "sky": sky(0.7)}, res=3), "smoke.interior_medium.sigma_t.data"
+    params, made, zeros = mi.traverse(scene), [], grid_integral.NodeGradient.zeros
+    monkeypatch.setattr(grid_integral.NodeGradient, "zeros", lambda *given: made.append(zeros(*given)) or made[-1])
+
+    def gradient():
+        dr.enable_grad(params[key])
+        dr.set_grad(params[key], 0)
+        mi.load_dict(mivol(max_depth=3)).render_backward(scene, params, dr.ones(mi.TensorXf, (3, 3, 3)), seed=1, spp=spp)
+        return np.array(dr.grad(params[key]))
+
+    chosen = gradient()
+    assert {each.packed for each in made} == {packs}
+    monkeypatch.setattr(grid_integral, "FEW_RAYS", math.inf if packs else 0)
+    other = gradient()
+    assert made[-1].packed != packs
+    # A node gets at most 8 numbers from each of 18 rays and of a few points, in another order.
+    np.testing.assert_allclose(chosen, other, rtol=0, atol=200 * 2.0**-24 * np.abs(other).max())
+    assert np.count_nonzero(other) > 100

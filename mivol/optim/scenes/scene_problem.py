@@ -50,7 +50,7 @@ from mivol.optim.scenes.views import (
     make_single_batches,
     remove_alpha,
 )
-from mivol.scene_graph import traverse
+from mivol.scene_graph import put_value, traverse
 
 LARGE_PASS = 1 << 16
 """Samples of a pass for which the host waits. It prepares what follows a smaller pass while the pass is computed."""
@@ -155,7 +155,7 @@ class SceneProblem(LinearizableProblem):
         self.params.update()
         # Mitsuba's envmap puts another array into the parameters: restore the attached array.
         for name, value in values.items():
-            self.params[name] = value
+            put_value(self.params, name, value)
         # An extinction alone does not make a medium scatter.
         if any("sigma_t" not in p.name.split(".") for p in self.parameters):
             self.noisy = self._has_noise()

@@ -14,6 +14,7 @@ the scale and the parameters of the part: ``jvp`` multiplies by the derivative, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
@@ -76,8 +77,8 @@ class Extinction(Protocol):
     def scaled(self, scale: mi.Float) -> mi.Float | mi.Color3f:
         """The array whose tangents a forward pass takes, attached to the scale and to the parameters."""
 
-    def start_gradient(self) -> Any:
-        """A gradient of zero for the ``vjp`` methods to add to."""
+    def start_gradient(self, rays: float = math.inf) -> Any:
+        """A gradient of zero for the ``vjp`` methods to add to, for so many rays."""
 
     def fold_gradient(self, gradient: Any) -> mi.Float:
         """The accumulated gradient of ``scaled(s)``, as a flat array."""
@@ -142,7 +143,7 @@ class ConstantExtinction:
     def scaled(self, scale: mi.Float) -> mi.Float | mi.Color3f:
         return scale * self.constant
 
-    def start_gradient(self) -> mi.Float:
+    def start_gradient(self, rays: float = math.inf) -> mi.Float:
         return dr.zeros(mi.Float, self.channels)
 
     def fold_gradient(self, gradient: mi.Float) -> mi.Float:
@@ -221,7 +222,7 @@ class BoundedExtinction:
     def scaled(self, scale: mi.Float) -> mi.Float:
         return scale
 
-    def start_gradient(self) -> mi.Float:
+    def start_gradient(self, rays: float = math.inf) -> mi.Float:
         return dr.zeros(mi.Float, 1)
 
     def fold_gradient(self, gradient: mi.Float) -> mi.Float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -78,7 +79,7 @@ class GaussianExtinction:
         rows = self.field.rows(scale)
         return dr.concat([rows, self.field.pack_colours()]) if self.shows else rows
 
-    def start_gradient(self) -> mi.Float:
+    def start_gradient(self, rays: float = math.inf) -> mi.Float:
         return dr.zeros(mi.Float, ROW_SIZE * self.field.count * (1 + self.blocks))
 
     def fold_gradient(self, gradient: mi.Float) -> mi.Float:

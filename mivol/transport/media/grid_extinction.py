@@ -10,6 +10,7 @@ Conventions. Values are detached arrays; channels are 1 (grey) or 3 (rgb), and a
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -71,8 +72,8 @@ class NodeValues:
     def scaled(self, scale: mi.Float) -> mi.Float:
         return scale * self.values
 
-    def start_gradient(self) -> NodeGradient:
-        return NodeGradient.zeros(self.lattice)
+    def start_gradient(self, rays: float = math.inf) -> NodeGradient:
+        return NodeGradient.zeros(self.lattice, rays)
 
     def fold_gradient(self, gradient: NodeGradient) -> mi.Float:
         return gradient.fold()

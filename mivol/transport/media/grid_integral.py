@@ -37,6 +37,11 @@ __all__ = [
 PACKED_LIMIT = 4 << 30
 """Largest size of a packed gradient [bytes]; a larger grid adds to its nodes individually."""
 
+FEW_RAYS = 0.125
+"""Rays for each cell of a face of a grid up to which the grid adds to its nodes individually. Few rays meet a small share of the
+cells, but a packed gradient is cleared and folded as a whole. (Both take equally long at 0.2 in grids of 128^3 and 256^3; at 0.06
+a gradient at depth 6 takes 215 ms in place of 345 ms of the processor in a grid of 256^3.)"""
+
 
 def integrate_tau(
     lattice: Lattice,
@@ -110,7 +115,7 @@ class NodeGradient:
 
     On the CPU a cell adds its 8 corners as a packet to a buffer with 8 numbers a cell and a copy for each thread, without
     atomics. The cells are summed to the nodes once, at the end (5 times faster than adding 8 numbers to the nodes). On a GPU,
-    or if the buffer is too large, the corners are added to the nodes directly.
+    for few rays, or if the buffer is too large, the corners are added to the nodes directly.
 
     Attributes:
         buffer: flat sums; corners of cells if ``packed``, else nodes.
@@ -125,12 +130,12 @@ class NodeGradient:
     packed: bool
 
     @classmethod
-    def zeros(cls, lattice: Lattice) -> NodeGradient:
-        """A gradient of zero for the nodes of ``lattice``."""
+    def zeros(cls, lattice: Lattice, rays: float = math.inf) -> NodeGradient:
+        """A gradient of zero for the nodes of ``lattice``, to which so many rays add."""
         z, y, x = lattice.res
         cells = (z + 1) * (y + 1) * (x + 1) * lattice.channels
         on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
-        packed = on_cpu and lattice.bricks is None and gradient_bytes(lattice.res, lattice.channels) <= PACKED_LIMIT
+        packed = on_cpu and lattice.bricks is None and packs_gradient(lattice.res, lattice.channels, rays)
         buffer = dr.zeros(mi.Float, 8 * cells if packed else dr.width(lattice.values.array))
         return cls(buffer, lattice, lattice.channels, packed)
 
@@ -162,6 +167,12 @@ class NodeGradient:
             cell = (c * (y + 1) + b) * (x + 1) + a
             total += dr.gather(mi.Float, self.buffer, (cell * self.channels + channel) * 8 + q)
         return total
+
+
+def packs_gradient(res: tuple[int, int, int], channels: int, rays: float) -> bool:
+    """Whether a processor packs the gradient of a grid, to which so many rays add."""
+    few = FEW_RAYS * math.prod(n + 1 for n in res) ** (2 / 3)
+    return rays > few and gradient_bytes(res, channels) <= PACKED_LIMIT
 
 
 def gradient_bytes(res: tuple[int, int, int], channels: int) -> int:

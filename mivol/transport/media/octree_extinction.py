@@ -11,6 +11,7 @@ holds the values (leaves, C) in the order of the codes. Leaves stay in place whi
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -239,7 +240,7 @@ class OctreeExtinction:
     def scaled(self, scale: mi.Float) -> mi.Float:
         return scale * self.field.values.array
 
-    def start_gradient(self) -> mi.Float:
+    def start_gradient(self, rays: float = math.inf) -> mi.Float:
         return dr.zeros(mi.Float, self.field.leaves * self.channels)
 
     def fold_gradient(self, gradient: mi.Float) -> mi.Float:

@@ -11,6 +11,7 @@ follow ``g`` as any other argument.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cached_property
 
@@ -177,11 +178,11 @@ class SceneMedia:
         for body in self.bodies:
             body.find_followed()
 
-    def start_gradients(self) -> None:
-        """Begin a reverse pass: set the gradient of each part to zero."""
+    def start_gradients(self, rays: float = math.inf) -> None:
+        """Begin a reverse pass of so many rays: set the gradient of each part to zero."""
         for body in self.bodies:
             body.microflakes_gradient = dr.zeros(mi.Float, 6) if is_followed(body.view.microflakes) else None
-            body.gradients = [part.start_gradient() for part in body.view.parts]
+            body.gradients = [part.start_gradient(rays) for part in body.view.parts]
 
     def deliver_gradients(self) -> None:
         """End a reverse pass: deliver the gradients of the parts to their parameters."""
