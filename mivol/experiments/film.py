@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from itertools import chain
 from pathlib import Path
+from tempfile import TemporaryFile
 
 import numpy as np
 import PIL.Image
@@ -221,16 +222,34 @@ def _pad_to_even(frame: NDArray) -> NDArray:
     return np.ascontiguousarray(np.pad(frame, ((0, rows), (0, columns), (0, 0)), mode="edge"))
 
 
-def _write_animation(path: Path, frames: Frames, fps: float, **more: str | int) -> None:
-    first, *rest = (PIL.Image.fromarray(frame) for frame in frames)
-    first.save(path, save_all=True, append_images=rest, duration=round(1000 / fps), loop=0, **more)
+def _write_gif(path: Path, frames: Frames, fps: float) -> None:
+    images = (PIL.Image.fromarray(frame) for frame in frames)
+    _save_animation(path, next(images), images, fps, "GIF")
+
+
+def _write_webp(path: Path, frames: Frames, fps: float) -> None:
+    """Pillow takes all frames of a .webp at once. They wait in a file, which Pillow reads in place."""
+    with TemporaryFile(dir=path.parent) as stored:
+        first = next(frames)
+        for frame in chain([first], frames):
+            stored.write(np.pad(frame, ((0, 0), (0, 0), (0, 1))).tobytes())
+        stored.flush()
+        pixels = np.memmap(stored, np.uint8, "r").reshape(-1, *first.shape[:2], 4)
+        images = [PIL.Image.frombuffer("RGBX", first.shape[1::-1], frame, "raw", "RGBX", 0, 1) for frame in pixels]
+        _save_animation(path, images[0], images[1:], fps, "WEBP", quality=90)
+
+
+def _save_animation(
+    path: Path, first: PIL.Image.Image, others: Iterable[PIL.Image.Image], fps: float, kind: str, **more: int
+) -> None:
+    first.save(path, kind, save_all=True, append_images=others, duration=round(1000 / fps), loop=0, **more)
 
 
 #: suffix -> writer.
 FILM_WRITERS: dict[str, Callable[[Path, Frames, float], None]] = {
     ".mp4": _write_mp4,
-    ".webp": partial(_write_animation, format="WEBP", quality=90),
-    ".gif": partial(_write_animation, format="GIF"),
+    ".webp": _write_webp,
+    ".gif": _write_gif,
 }
 
 

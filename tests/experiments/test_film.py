@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -155,6 +157,25 @@ def test_a_webp_needs_no_ffmpeg_and_has_all_colours(tmp_path: Path, monkeypatch:
         assert film.info["duration"] == 125
         # Lossy at quality 90: 8-bit YUV rounds, and the quantiser has steps of 2 to 3 codes.
         np.testing.assert_allclose(np.asarray(film.convert("RGB"), float), frames()[5], atol=6)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the memory of a process is read from /proc")
+@pytest.mark.parametrize("suffix", film.FILM_WRITERS)
+def test_memory_does_not_hold_the_frames_of_a_film(tmp_path: Path, suffix: str) -> None:
+    """160 frames have 66 MB as Pillow holds them."""
+    if suffix == ".mp4":
+        pytest.importorskip("imageio_ffmpeg")
+    used = []
+
+    def render() -> Iterator[np.ndarray]:
+        for number in range(160):
+            frame = np.full((320, 320, 3), 100, np.uint8)
+            frame[number] = 200
+            used.append(int(re.search(r"RssAnon:\s+(\d+)", Path("/proc/self/status").read_text()).group(1)) / 1024)
+            yield frame
+
+    write_video(tmp_path / f"film{suffix}", render())
+    assert used[-1] - used[10] < 16
 
 
 @pytest.mark.parametrize("module", [None, SimpleNamespace(get_ffmpeg_exe=Mock(side_effect=RuntimeError("No ffmpeg exe")))])

@@ -38,9 +38,9 @@ PACKED_LIMIT = 4 << 30
 """Largest size of a packed gradient [bytes]; a larger grid adds to its nodes individually."""
 
 FEW_RAYS = 0.125
-"""Rays for each cell of a face of a grid up to which the grid adds to its nodes individually. Few rays meet a small share of the
-cells, but a packed gradient is cleared and folded as a whole. (Both take equally long at 0.2 in grids of 128^3 and 256^3; at 0.06
-a gradient at depth 6 takes 215 ms in place of 345 ms of the processor in a grid of 256^3.)"""
+"""Rays for each cell of a face of a grid up to which the grid adds to its nodes individually. Few rays meet a small share of
+the cells, and a packed gradient is cleared and folded as a whole. (Grids of 128^3 and 256^3 break even at 0.2. At 0.06 a
+gradient at depth 6 in a grid of 256^3 takes 215 ms in place of 345 ms of the processor.)"""
 
 
 def integrate_tau(
