@@ -261,11 +261,13 @@ def _find_given_sensor(scene: mi.Scene, sensor: int | Mapping[str, object] | mi.
 def _channels(film: mi.Film) -> int:
     """Colour channels of a film: 3, or 1 in mono variants."""
     printed = str(film)
-    wanted = ("y", "ya") if "mono" in mi.variant() else ("rgb", "rgba")
+    wanted, name = (("y", "ya"), "luminance") if "mono" in mi.variant() else (("rgb", "rgba"), "rgb")
     found = next((line.split("=")[1].strip(" ,") for line in printed.splitlines() if "pixel_format" in line), "")
     if found not in wanted:
         format_ = found or film.class_name()
-        raise MivolError(f'the film has the pixel format "{format_}"; a reference needs {" or ".join(wanted)}.')
+        raise MivolError(
+            f'the film has the pixel format "{format_}", expected {" or ".join(wanted)} for a reference: set pixel_format = "{name}".'
+        )
     return 3 if found.startswith("rgb") else 1
 
 
