@@ -4,9 +4,9 @@ NetCDF-4 is HDF5, read through h5py; the classic format and its 64-bit offsets a
 
 Conventions (CF). A dimension is an axis by the attribute ``axis`` or ``standard_name`` of its coordinate, or by its name; else
 the last three dimensions are (z, y, x). Coordinates are the centres of voxels, in metres or in a unit that is converted to
-metres; values per length, such as extinctions, become values per metre with them. A descending axis is turned around. Uneven steps, as of stretched levels, become even steps of the smallest one: a new
-voxel is the mean of the overlapped voxels, so integrals along the axis are kept. ``name[3]`` is entry 3 of the dimension
-before the axes.
+metres; values per length, such as extinctions, become values per metre with them. A descending axis is turned around. Uneven
+steps, as of stretched levels, become even steps of the smallest one: a new voxel is the mean of the overlapped voxels, so
+integrals along the axis are kept. ``name[3]`` is entry 3 of the dimension before the axes.
 
 References: NetCDF Climate and Forecast Metadata Conventions 1.11, chapters 4, 5 and 8; AT3D's ``load_from_netcdf`` (lwc, reff).
 """

@@ -266,7 +266,8 @@ def _channels(film: mi.Film) -> int:
     if found not in wanted:
         format_ = found or film.class_name()
         raise MivolError(
-            f'the film has the pixel format "{format_}", expected {" or ".join(wanted)} for a reference: set pixel_format = "{name}".'
+            f'the film has the pixel format "{format_}", expected {" or ".join(wanted)} for a reference: set pixel_format to'
+            f' "{name}".'
         )
     return 3 if found.startswith("rgb") else 1
 
