@@ -74,9 +74,6 @@ def _has_no_image(film: mi.Film) -> bool:
         return True
 
 
-MAX_LENSES = 256
-"""Most cameras whose lens is remembered: the host waits for all kernels before it reads numbers of a lens."""
-
 MAX_CAMERAS = 256
 """Most cameras whose numbers a stand-in keeps."""
 
