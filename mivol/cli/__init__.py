@@ -35,7 +35,7 @@ from mivol.cli.inputs import draft_scan_of, explain, load_experiment, load_named
 from mivol.errors import MivolError
 from mivol.optim.interrupt import Signals
 
-USAGE, STOPPED, UNREAD = 2, 130, 141
+STOPPED, UNREAD = 130, 141
 
 DESCRIPTION = """Differentiable and inverse volume rendering on Mitsuba 3. "mivol doctor" checks whether this machine can
 render. "mivol demo" lists examples. "mivol VERB --help" explains a verb."""
