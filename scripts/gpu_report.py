@@ -1,7 +1,8 @@
 """Test and time mivol on a GPU: one JSON file and one table, within a number of minutes.
 
-    scripts/on_a_gpu                          12 minutes on cuda_ad_rgb
+    scripts/on_a_gpu                          half an hour at most on cuda_ad_rgb
     scripts/on_a_gpu --only tests steps       some of the parts
+    scripts/on_a_gpu --only samples chair_hash chair_nerf      hash grids and NeRFs alone, within 16 minutes
     scripts/on_a_gpu --variant llvm_ad_rgb    the same parts on the processor
 
 Each part is a process of its own with a limit of time, so that a part that fails, waits or kills its process costs the others
@@ -45,7 +46,8 @@ class Part:
 
 def bench(study: str, *more: str) -> Callable[[str, Path], list[str]]:
     """The command of a study of the bench."""
-    return lambda variant, out: ["-m", "mivol", "bench", study, "--variant", variant, "--out", str(out / study), *more]
+    folder = "_".join([study, *more[1:2]]) if more[:1] == ("--only",) else study
+    return lambda variant, out: ["-m", "mivol", "bench", study, "--variant", variant, "--out", str(out / folder), *more]
 
 
 def fit(preset: str, kind: str) -> Callable[[str, Path], list[str]]:
@@ -85,8 +87,11 @@ PARTS = (
     Part("gaussians", 60, bench("points", "--only", "clouds")),
     Part("chair_gaussians", 100, fit("gpu", "gaussians"), "multiview/chair"),
     Part("chair_grid", 80, fit("gpu", "grid"), "multiview/chair"),
+    Part("samples", 60, bench("gpu", "--only", "samples")),
+    Part("chair_hash", 300, bench("gpu", "--only", "hash"), "multiview/chair"),
+    Part("chair_nerf", 600, bench("gpu", "--only", "nerf"), "multiview/chair"),
 )
-"""The parts in their order; their limits sum to 12 minutes."""
+"""The parts in their order; their limits sum to 28 minutes."""
 
 
 @dataclass
@@ -134,10 +139,11 @@ def run_part(part: Part, variant: str, out: Path) -> Result:
 def write_report(results: Sequence[Result], variant: str, out: Path) -> str:
     """Write ``report.json`` and ``report.md``; return the text of the latter."""
     gpus = [asdict(gpu) for gpu in list_gpus()]
-    told = {"variant": variant, "gpus": gpus, "parts": [asdict(result) for result in results]}
+    date = time.strftime("%Y-%m-%d")
+    told = {"variant": variant, "date": date, "gpus": gpus, "parts": [asdict(result) for result in results]}
     (out / "report.json").write_text(json.dumps(told, indent=1))
     lines = [
-        f"{variant}: {', '.join(gpu['name'] for gpu in gpus) or 'no GPU'}",
+        f"{variant}: {', '.join(gpu['name'] for gpu in gpus) or 'no GPU'}, {date}",
         "",
         "| part | state | time [s] |",
         "|---|---|---|",

@@ -28,7 +28,7 @@ from mivol.errors import MivolError
 from mivol.experiments import gaussian_fit
 from mivol.experiments.field_fit import adapt_plan, make_batches, make_plan
 from mivol.experiments.gaussian_fit import make_gaussian_plan, start_gaussians
-from mivol.experiments.octree_fit import adapt_octree_plan, make_octree_plan
+from mivol.experiments.octree_fit import adapt_octree_plan, find_preset, make_octree_plan
 from mivol.experiments.photo_data import add_box, read_photos
 from mivol.experiments.sampled_fit import make_sampled_plan, make_sampled_problem
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
@@ -178,7 +178,7 @@ def prepare_fit(
         problem = RadianceProblem(make_batches(plan, train), train.box, plan)
         return PhotoProblem(problem, train, judged, sum(stage.steps for stage in plan.stages))
     if isinstance(chosen, config.OctreeExperiment):
-        planned, _, batches = adapt_octree_plan(make_octree_plan(chosen), chosen.field.preset, train)
+        planned, _, batches = adapt_octree_plan(make_octree_plan(chosen), find_preset(chosen.field), train)
         return PhotoProblem(OctreeProblem(batches, train.box, planned, seed), train, judged, planned.steps)
     if isinstance(chosen, config.HashExperiment | config.NerfExperiment):
         problem = make_sampled_problem(make_sampled_plan(chosen), train, seed)

@@ -54,8 +54,7 @@ def model_flags(text: str) -> list[tuple[tuple[str, ...], dict[str, Any]]]:
             "--preset",
             help="preset of that model; of Gaussians: minute (default), minutes, fine, ...; of a grid: cpu (default) for an "
             "object, capture for a place around the cameras, ...; of a hash grid: minute (default), minutes, gpu; of a "
-            "NeRF: tiny, minutes (default), gpu; of an "
-            "octree: the grid's",
+            "NeRF: tiny, minutes (default), gpu; of an octree: the preset of its grid",
         ),
     ]
 

@@ -25,6 +25,7 @@ from mivol.config.photos import (
     HashExperiment,
     NerfExperiment,
     OctreeExperiment,
+    OctreeSettings,
     ShowSettings,
 )
 from mivol.config.scans import (
@@ -51,11 +52,11 @@ from mivol.optim.strategy import suggest_name
 from mivol.schema import check_keys, explain_error
 
 __all__ = [
-    "AUTO", "CAPTURE", "Cone", "Detector", "EXPERIMENTS", "Ellipsoids", "Experiment", "FIELD_KINDS", "FieldExperiment", "Files",
-    "GaussianExperiment", "HashExperiment", "KINDS", "Known", "MODELS", "Matrices", "Measured", "NOT_RESULT", "NerfExperiment",
-    "Nikon", "OctreeExperiment", "OfData", "Parallel", "PhotoExperiment", "Readings", "Rendered", "ScanExperiment",
-    "SceneExperiment", "Section", "ShowSettings", "SolveSettings", "Sought", "Stack", "Table", "Truth", "apply_change",
-    "flatten_settings", "from_dict", "is_circle", "load", "of_photographs", "resolved",
+    "AUTO", "CAPTURE", "Cone", "Detector", "EXPERIMENTS", "Ellipsoids", "Experiment", "FIELD_KINDS", "FieldExperiment",
+    "Files", "GaussianExperiment", "HashExperiment", "KINDS", "Known", "MODELS", "Matrices", "Measured", "NOT_RESULT",
+    "NerfExperiment", "Nikon", "OctreeExperiment", "OctreeSettings", "OfData", "Parallel", "PhotoExperiment", "Readings",
+    "Rendered", "ScanExperiment", "SceneExperiment", "Section", "ShowSettings", "SolveSettings", "Sought", "Stack", "Table",
+    "Truth", "apply_change", "flatten_settings", "from_dict", "is_circle", "load", "of_photographs", "resolved",
 ]  # fmt: skip
 
 DEEP_KEY = re.compile(r"(?<![\w\"'.-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){100}")

@@ -251,8 +251,18 @@ class OctreeSettings(Section):
             "field (.npz) to begin at: grid, octree, hash grid or NeRF; hash or nerf: fit one first; empty: fit a grid first",
         ),
     ] = ""
-    preset: Annotated[str, setting("1", "of the grid: tiny, cpu, fine or gpu", min_length=1)] = "cpu"
-    effort: Annotated[float, setting("1", "factor on the steps of grid and octree", gt=0)] = 1.0
+    preset: (
+        Annotated[
+            str,
+            setting(
+                "1",
+                "of the grid (tiny, cpu, fine, gpu) or the network at start; absent: cpu, minute (hash) or minutes (nerf)",
+                min_length=1,
+            ),
+        ]
+        | None
+    ) = None
+    effort: Annotated[float, setting("1", "factor on the steps of octree and grid or network", gt=0)] = 1.0
     longest: (
         Annotated[int, setting("voxel", "voxels of the grid along its longest edge; absent: preset", ge=8, le=2048)] | None
     ) = None

@@ -384,28 +384,51 @@ def describe_field(path: Path, variant: str) -> Explanation:
     """
     set_variant(variant)
     field = read_field(check_file(path))
+    corners = field_place(field)[:3] @ np.array([[0, 0, 0, 1], [1, 1, 1, 1]], np.float64).T
+    low, high = (", ".join(f"{v:.4g}" for v in corner) for corner in np.sort(corners.T, axis=0))
+    file_size = f"{path.stat().st_size / 2**20:.2f} MiB in the file"
+    box = f"box         ({low}) to ({high}) [length]"
     if isinstance(field, SampledField):
-        return Explanation((f"{field.noun:<12}{field!r}", f"memory      {path.stat().st_size / 2**20:.2f} MiB in the file"))
+        memory = f"memory      {4 * field.numbers / 2**20:.1f} MiB, {file_size}"
+        return Explanation((*_describe_network(field, box), memory, WAYS))
     density, _ = field.values()
     if isinstance(field, Octree):
-        place, kind = field.to_world, f"octree      {describe_leaves(field)}"
+        kind = f"octree      {describe_leaves(field)}"
         look = f"colours     {field.colours}, offset {field.offset:g}, {field.space}"
     else:
         counts, stored = " x ".join(map(str, field.res[::-1])), len(field.stored_nodes())
         levels = f"{field.levels} nested levels of " if field.levels > 1 else ""
-        place = field.level_to_world(field.levels - 1)
         kind = f"grid        {levels}{counts} nodes, {stored} of them stored, degree {field.degree}"
         density = np.array(field.activation_function.value_and_slope(mi.Float(density))[0])
         look = f"colours     {'clamp' if field.clamp else 'no clamp'}, offset {field.offset:g}, {field.space}"
-    corners = place[:3] @ np.array([[0, 0, 0, 1], [1, 1, 1, 1]], np.float64).T
-    low, high = (", ".join(f"{v:.4g}" for v in corner) for corner in np.sort(corners.T, axis=0))
-    return Explanation(
-        (
-            kind,
-            f"box         ({low}) to ({high}) [length]",
-            f"extinction  {density.min():.4g} to {density.max():.4g} [1/length], median {np.median(density):.4g}",
-            look,
-            f"memory      {field.bytes / 2**20:.1f} MiB, {path.stat().st_size / 2**20:.2f} MiB in the file",
-            "mivol render draws it; mivol convert and mivol export write it in other formats",
-        )
-    )
+    spread = f"extinction  {density.min():.4g} to {density.max():.4g} [1/length], median {np.median(density):.4g}"
+    return Explanation((kind, box, spread, look, f"memory      {field.bytes / 2**20:.1f} MiB, {file_size}", WAYS))
+
+
+SAMPLED_TWICE = "samples     where the coarse network has weight"
+
+MOST_POINTS = 1 << 16
+"""Most points at which ``mivol explain`` evaluates a network."""
+
+WAYS = "mivol render draws it; mivol convert and mivol export write it in other formats"
+
+
+def field_place(field: SphericalGrid | Octree | SampledField) -> np.ndarray:
+    """(4, 4) unit cube to the whole box of a field."""
+    return field.level_to_world(field.levels - 1) if isinstance(field, SphericalGrid) else field.to_world
+
+
+def _describe_network(field: SampledField, box: str) -> list[str]:
+    """Facts about a hash grid or a NeRF: sizes, box, occupied cells, steps, extinction and colours."""
+    (model, numbers), occupied = field.sizes.describe(field.edges), np.flatnonzero(np.array(field.region.occupied))
+    places = field.region.middles(occupied[:: len(occupied) // MOST_POINTS + 1]).T.astype(np.float32)
+    density = np.array(field.density(mi.Point3f(np.ascontiguousarray(places)))) if occupied.size else np.zeros(1)
+    cells = dr.width(field.region.occupied)
+    return [
+        f"{field.noun:<12}{model}; {numbers}",
+        box,
+        f"occupied    {occupied.size} of {cells} cells ({occupied.size / cells:.1%}), outside of which it is 0",
+        f"samples     at most {field.region.step:.4g} [length] apart" if field.coarse is None else SAMPLED_TWICE,
+        f"extinction  {density.min():.4g} to {density.max():.4g} [1/length], median {np.median(density):.4g}, in their middles",
+        f"colours     {field.space}",
+    ]

@@ -10,16 +10,18 @@ import json
 import math
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mivol.config import OctreeExperiment
+from mivol.config import OctreeExperiment, OctreeSettings
 from mivol.errors import MivolError
 from mivol.experiments.field_conversion import describe_leaves, describe_speed
 from mivol.experiments.field_fit import FieldFit, adapt_plan, explain_plan, make_batches, set_background, write_result
+from mivol.experiments.fit_kind import Say
 from mivol.experiments.run_folder import RunFolder
-from mivol.experiments.sampled_fit import explain_sampled_plan, make_sampled_problem
+from mivol.experiments.sampled_fit import SampledFit, explain_sampled_plan, make_sampled_problem
 from mivol.fields.field_files import read_field, write_field
 from mivol.fields.octree import Octree
 from mivol.fields.sampled_field import SampledField
@@ -33,16 +35,22 @@ from mivol.optim.photographs.radiance_plan import PRESETS, RadiancePlan
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.photographs.sampled_problem import PRESETS as PRESETS_OF_NETWORKS
 from mivol.optim.photographs.sampled_problem import SampledPlan
-from mivol.optim.strategy import suggest_name
 from mivol.photos import Photos
 from mivol.report.record import PlanLine, Table
+from mivol.scene.explain import Explanation
 from mivol.validate.metrics import score_image
 
 STAGES = "grid", "octree", "octree, its leaves fitted"
 """Names of the stages on the page."""
 
+STAGE_ROWS = "stages.json"
+"""File in ``stages/`` with the rows of the finished stages."""
+
 NETWORKS = {"hash": "minute", "nerf": "minutes"}
-"""Presets of the networks that ``field.start`` names: the first level of a template of two."""
+"""Networks that ``field.start`` names, the first level of a template of two, and their presets without ``field.preset``."""
+
+GRID_PRESET = "cpu"
+"""Preset of the grid without ``field.preset``."""
 
 
 AnyField = SphericalGrid | Octree | SampledField
@@ -66,9 +74,10 @@ class OctreeFit(FieldFit):
         return make_octree_plan(settings)
 
     def describe_run(self) -> dict[str, Any]:
-        start = self.settings.field.start or f"a grid, preset {self.settings.field.preset}"
+        preset = find_preset(self.settings.field)
+        start = self.settings.field.start or f"a grid, preset {preset}"
         if start in NETWORKS:
-            start = f"a {PRESETS_OF_NETWORKS[start][NETWORKS[start]].model.noun}, preset {NETWORKS[start]}"
+            start = f"a {make_network_plan(self.settings).model.noun}, preset {preset}"
         return {
             "method": f"an octree of harmonics from {start}, its leaves fitted to photographs",
             "seeds": {"fit": self.settings.seed},
@@ -77,7 +86,7 @@ class OctreeFit(FieldFit):
         }
 
     def plan_fit(self) -> list[PlanLine]:
-        self.plan, grid, self.batches = adapt_octree_plan(self.plan, self.settings.field.preset, self.photos)
+        self.plan, grid, self.batches = adapt_octree_plan(self.plan, find_preset(self.settings.field), self.photos)
         leaves = self.plan.leaves
         steps = PlanLine(
             choice=f"{leaves.steps} steps of the octree, photographs shrunk by {leaves.shrink}",
@@ -89,6 +98,7 @@ class OctreeFit(FieldFit):
             reason=f"field.keep_weight; eight become one if views change by less than {self.plan.recipe.tolerance:g}",
         )
         if self.plan.grid is None:
+            self.steps = SampledFit.steps
             first = [PlanLine(choice=f"begins at {self.settings.field.start}", reason="field.start")]
             if self.settings.field.start in NETWORKS:
                 first = explain_sampled_plan(make_network_plan(self.settings), self.photos, self.batches)
@@ -102,14 +112,22 @@ class OctreeFit(FieldFit):
         if self.settings.field.start not in NETWORKS:
             return
         run.make("stages")
-        path = run.path / "stages" / f"{self.settings.field.start}.npz"
-        if run.is_resumed and path.is_file():
-            self.network = read_start(path, self.photos.space, self.photos.white)
-            return
+        path, kept = run.path / "stages" / f"{self.settings.field.start}.npz", run.path / "stages" / STAGE_ROWS
         plan = make_network_plan(self.settings)
+        if run.is_resumed and path.is_file() and kept.is_file():
+            self.network = read_start(path, self.photos.space, self.photos.white)
+            self.fitted = float(json.loads(kept.read_text())[0][-1])
+            self.record.timings[plan.model.noun] = self.fitted
+            return
+        with run.stage(plan.model.noun):
+            self.fit_network(run, plan, path)
+
+    def fit_network(self, run: RunFolder, plan: SampledPlan, path: Path) -> None:
+        """Fit the hash grid or the NeRF, and write it to ``path``."""
         problem = make_sampled_problem(plan, self.photos, self.settings.seed)
         fit = begin_fit(problem, plan.optimizer, plan.course())
-        fit.complete()
+        with self.context.progress.watch(plan.steps) as show:
+            fit.complete(show)
         self.clock = self.fitted = fit.seconds
         write_field(path, problem.field.scale_colours(self.photos.white), view=self.home_view)
         self.network = read_start(path, self.photos.space, self.photos.white)
@@ -146,7 +164,7 @@ class OctreeFit(FieldFit):
             return self.add_stage(run, name, field)
 
         self.problem.report = report
-        kept = run.path / "stages" / "stages.json"
+        kept = run.path / "stages" / STAGE_ROWS
         if run.is_resumed and kept.is_file():
             self.stage_rows = [tuple(row) for row in json.loads(kept.read_text())]
         elif self.start is not None:
@@ -168,8 +186,8 @@ class OctreeFit(FieldFit):
         size = path.stat().st_size
         held = 4 * field.numbers if isinstance(field, SampledField) else field.bytes
         quality = "-" if psnr is None else f"{psnr:.2f}"
-        self.stage_rows.append((name, count, quality, f"{size / 2**20:.2f}", f"{held / 2**20:.1f}", f"{self.clock:.0f}"))
-        write_whole(run.path / "stages" / "stages.json", lambda file: file.write(json.dumps(self.stage_rows).encode()))
+        self.stage_rows.append((name, count, quality, f"{size / 2**20:.2f}", f"{held / 2**20:.3g}", f"{self.clock:.0f}"))
+        write_whole(run.path / "stages" / STAGE_ROWS, lambda file: file.write(json.dumps(self.stage_rows).encode()))
         return f"{name}: {quality} dB, {count}, a file of {size / 2**20:.2f} MiB, after {self.clock:.0f} s"
 
     def mean_psnr(self, field: AnyField) -> float | None:
@@ -203,6 +221,13 @@ class OctreeFit(FieldFit):
     def motions(self) -> None:
         return None
 
+    def rehearse(self, say: Say) -> Explanation:
+        if self.settings.field.start not in NETWORKS:
+            return super().rehearse(say)
+        plan = make_network_plan(self.settings)
+        plan.optimizer.begin(make_sampled_problem(plan, self.photos, self.settings.seed))
+        return Explanation(())
+
 
 def count_parts(field: AnyField) -> str:
     """Leaves, nodes or numbers of a field, with the word."""
@@ -211,10 +236,23 @@ def count_parts(field: AnyField) -> str:
     return f"{field.numbers} numbers" if isinstance(field, SampledField) else f"{len(field.stored_nodes())} nodes"
 
 
+def find_preset(options: OctreeSettings) -> str:
+    """The preset of the fit's first model: of the network that ``field.start`` names, or of the grid.
+
+    Raises:
+        MivolError: an unknown preset.
+    """
+    preset = options.preset or NETWORKS.get(options.start, GRID_PRESET)
+    known = PRESETS_OF_NETWORKS.get(options.start, PRESETS)
+    if preset not in known:
+        model = f"{options.start} network" if options.start in NETWORKS else "grid"
+        raise MivolError(f'field.preset = "{preset}" is no preset of the {model}: choose one of {", ".join(known)}.')
+    return preset
+
+
 def make_network_plan(settings: OctreeExperiment) -> SampledPlan:
     """The plan of the hash grid or the NeRF that ``field.start`` names."""
-    kind = settings.field.start
-    plan = PRESETS_OF_NETWORKS[kind][NETWORKS[kind]]
+    plan = PRESETS_OF_NETWORKS[settings.field.start][find_preset(settings.field)]
     return replace(plan, steps=max(1, round(plan.steps * settings.field.effort)))
 
 
@@ -223,8 +261,9 @@ def adapt_octree_plan(plan: OctreePlan, preset: str, photos: Photos) -> tuple[Oc
 
     Returns:
         The plan; the plan of its grid, or of a grid of the preset for a plan that begins at a field; and the photographs.
+        Presets that only networks have take the grid of ``GRID_PRESET``.
     """
-    grid = adapt_plan(plan.grid or PRESETS[preset], photos)
+    grid = adapt_plan(plan.grid or PRESETS.get(preset, PRESETS[GRID_PRESET]), photos)
     last = grid.stages[-1]
     leaves = replace(plan.leaves, shrink=last.shrink, views=last.views, tiles=last.tiles, matte=grid.matte)
     stages = (*(grid.stages if plan.grid else ()), last)
@@ -259,9 +298,7 @@ def make_octree_plan(settings: OctreeExperiment) -> OctreePlan:
         MivolError: an unknown preset, or one with nested boxes or a fitted background.
     """
     options = settings.field
-    if options.preset not in PRESETS:
-        raise MivolError(f'field.preset = "{options.preset}" is unknown: {suggest_name(options.preset, list(PRESETS))}')
-    grid = set_background(PRESETS[options.preset], settings.photos.background)
+    grid = set_background(PRESETS.get(find_preset(options), PRESETS[GRID_PRESET]), settings.photos.background)
     if grid.levels > 1 or grid.sky:
         raise MivolError(
             "an octree has one box and a known background, and nested boxes or a fitted sky were asked for: "

@@ -134,7 +134,7 @@ def parse_sampled_archive(name: str, arrays: dict[str, np.ndarray]) -> SampledFi
     expected = SAMPLED_KINDS | kind.own_arrays | dict.fromkeys(kind.parameter_names(), ("f", None))
     missing = expected.keys() - arrays.keys()
     if missing:
-        raise MivolError(f"{name} lacks {', '.join(sorted(missing))}; write it again.")
+        raise MivolError(f"{name} lacks {', '.join(sorted(missing))}, which a field of mivol holds: write it again.")
     check_arrays(name, arrays, expected)
     res = tuple(int(n) for n in arrays["res"])
     cells = math.prod(n + 1 for n in res)
@@ -188,7 +188,7 @@ def parse_archive(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
     """
     missing = {"density", "sh", "res", "to_world", "activation", "offset", "clamp", "levels", "space"} - arrays.keys()
     if missing:
-        raise MivolError(f"{name} lacks {', '.join(sorted(missing))}; write it again.")
+        raise MivolError(f"{name} lacks {', '.join(sorted(missing))}, which a field of mivol holds: write it again.")
     check_arrays(name, arrays, ARRAY_KINDS)
     _check_node_count(name, arrays)
     res, levels = tuple(int(n) for n in arrays["res"]), int(arrays["levels"])
@@ -224,7 +224,9 @@ def _check_node_count(name: str, arrays: dict[str, np.ndarray]) -> None:
 def _check_nodes(name: str, nodes: np.ndarray, count: int) -> None:
     ordered = nodes.ndim == 1 and (len(nodes) < 2 or (np.diff(nodes.astype(np.int64)) > 0).all())
     if not ordered or (len(nodes) and not (int(nodes[0]) >= 0 and int(nodes[-1]) < count)):
-        raise MivolError(f"{name} lists nodes out of order or beyond the {count} of its grid; write it again.")
+        raise MivolError(
+            f"{name} lists nodes out of order or beyond the {count} of its grid; ascending ones are expected: write it again."
+        )
 
 
 # -- Checkpoints of svox2 ----------------------------------------------------------------------------------------------
@@ -278,23 +280,29 @@ def parse_svox2(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
     """
     missing = {"density_data", "sh_data", "radius", "center"} - arrays.keys()
     if missing:
-        raise MivolError(f"{name} has links but lacks {', '.join(sorted(missing))}; a checkpoint of svox2 holds them.")
+        raise MivolError(
+            f"{name} has links but lacks {', '.join(sorted(missing))}, which a checkpoint of svox2 holds: save it again."
+        )
     _check_svox2_arrays(name, arrays)
     if int(arrays.get("basis_type", SVOX2_SH)) != SVOX2_SH:
         found = int(arrays["basis_type"])
-        raise MivolError(f"{name} is of svox2's basis type {found}; only spherical harmonics (1) can be read.")
+        raise MivolError(
+            f"{name} is of svox2's basis type {found}; only spherical harmonics (1) can be read: train with that basis."
+        )
     if arrays.get("background_data", np.empty(0)).size:
         raise MivolError(f"{name} has a background of sphere layers, which mivol does not model; save it without one.")
     links, sh = arrays["links"].transpose(2, 1, 0), arrays["sh_data"].astype(np.float32)
     density = arrays["density_data"].astype(np.float32).reshape(-1)
     if sh.ndim != 2 or len(sh) != len(density) or sh.shape[1] % 3 or links.max(initial=-1) >= len(density):
         found = f"links {links.shape}, densities {density.shape} and harmonics {sh.shape}"
-        raise MivolError(f"{name} holds {found} that do not fit together; write it again.")
+        raise MivolError(f"{name} holds {found} that do not fit together; a row for each link is expected: write it again.")
     nodes = np.flatnonzero(links >= 0)
     row = links.reshape(-1)[nodes]
     rows = sh[row].reshape(len(row), 3, -1).transpose(0, 2, 1)
     if nodes.size and (not np.isfinite(density[row]).all() or not np.isfinite(sh[row]).all()):
-        raise MivolError(f"{name} holds densities or harmonics that are not finite; write it again.")
+        raise MivolError(
+            f"{name} holds densities or harmonics that are not finite; finite numbers are expected: write it again."
+        )
     radius, center = (np.broadcast_to(np.asarray(arrays[k], np.float64).reshape(-1), 3) for k in ("radius", "center"))
     to_world = np.eye(4)
     to_world[:3, :3], to_world[:3, 3] = np.diag(2 * radius), center - radius

@@ -28,6 +28,7 @@ from mivol.errors import MivolError
 from mivol.fields.harmonics import SPACES, basis_size, harmonic_degree, local_frame, rotate_direction, row_width
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.kernel_recording import copy_aligned
+from mivol.machine import check_memory
 from mivol.space import check_affine
 
 __all__ = ["COLOUR_MAPS", "MAX_DEPTH", "MAX_LEAVES", "Octree", "interleave", "separate"]
@@ -82,11 +83,11 @@ class Octree:
         if self.colours not in COLOUR_MAPS or self.space not in SPACES:
             raise MivolError(
                 f"an octree with colours {self.colours!r} in the space {self.space!r} was given; "
-                f"{' or '.join(COLOUR_MAPS)} and {' or '.join(SPACES)} are expected."
+                f"{' or '.join(COLOUR_MAPS)} and {' or '.join(SPACES)} are expected: give those."
             )
         n = len(self.codes)
         if not 1 <= n <= MAX_LEAVES:
-            raise MivolError(f"an octree of {n} leaves was given; 1 to {MAX_LEAVES} are expected.")
+            raise MivolError(f"an octree of {n} leaves was given; 1 to {MAX_LEAVES} are expected: choose a smaller depth.")
         if len(self.sizes) != n or dr.width(self.density) != n or dr.width(self.harmonics) != n * self.width:
             found = f"{len(self.sizes)} sizes, {dr.width(self.density)} densities and {dr.width(self.harmonics)} coefficients"
             raise MivolError(f"{found} were given for {n} leaves; 1, 1 and {self.width} a leaf are expected.")
@@ -262,8 +263,11 @@ class Octree:
         counts = cells_of(self.sizes - smallest).astype(np.int64)
         if counts.sum() > MAX_LEAVES:
             raise MivolError(
-                f"an octree of {counts.sum()} cells would be a grid of as many nodes; at most {MAX_LEAVES} are expected."
+                f"an octree of {counts.sum()} cells would be a grid of as many nodes; at most {MAX_LEAVES} are expected: "
+                "keep it as an octree."
             )
+        needed = int(counts.sum()) * (PLACE_BYTES + 3 * 4 * 3 * self.basis)  # three copies of the coefficients
+        check_memory(needed, f"a grid of an octree of {counts.sum()} cells", "keep it as an octree")
         owner = np.repeat(np.arange(self.leaves), counts)
         within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
         first = self.codes >> np.uint64(3 * smallest)
@@ -273,7 +277,7 @@ class Octree:
         number = ((place[:, 2] - lowest[2]) * n[1] + place[:, 1] - lowest[1]) * n[0] + place[:, 0] - lowest[0]
         if np.prod(n, dtype=np.float64) >= 2**31:
             raise MivolError(
-                f"an octree over {' x '.join(map(str, n))} cells is too large for a grid; at most 2^31 are expected."
+                f"an octree over {' x '.join(map(str, n))} cells is too large for a grid; at most 2^31 are expected: keep it."
             )
         order = np.argsort(number)
         density, sh = self.values()
@@ -285,6 +289,9 @@ class Octree:
         res = (int(n[2]), int(n[1]), int(n[0]))
         return SphericalGrid.from_rows(res, self.to_world @ box, *rows, nodes, "relu", self.offset, space=self.space)
 
+
+PLACE_BYTES = 80
+"""Memory of a node's place while a grid is made [bytes]: its leaf, cell and order."""
 
 CODE_RANGE = 1 / 512, 511 / 512
 """Colours that a sigmoid shows without coefficients of more than 6.2: half a step of 8 bits from black and white."""
@@ -307,7 +314,7 @@ def _spread_basis(degree: int) -> np.ndarray:
 def check_depth(depth: int) -> None:
     """Refuse a depth beyond 0 to ``MAX_DEPTH``."""
     if not 0 <= depth <= MAX_DEPTH:
-        raise MivolError(f"an octree of depth {depth} was given; 0 to {MAX_DEPTH} are expected.")
+        raise MivolError(f"an octree of depth {depth} was given; 0 to {MAX_DEPTH} are expected: choose fewer levels.")
 
 
 def cells_of(sizes: np.ndarray) -> np.ndarray:

@@ -128,7 +128,7 @@ def parse_octree(name: str, arrays: dict[str, np.ndarray]) -> Octree:
     """
     missing = KINDS.keys() - arrays.keys()
     if missing:
-        raise MivolError(f"{name} lacks {', '.join(sorted(missing))}; write it again.")
+        raise MivolError(f"{name} lacks {', '.join(sorted(missing))}, which an octree of mivol holds: write it again.")
     check_arrays(name, arrays, KINDS)
     depth = int(arrays["depth"])
     try:
@@ -136,13 +136,14 @@ def parse_octree(name: str, arrays: dict[str, np.ndarray]) -> Octree:
         harmonic_degree(1 + len(np.atleast_1d(arrays["directional"])))
     except MivolError as error:
         raise MivolError(f"{name}: {error}") from None
-    codes, sizes = _leaves_of(name, arrays["tree"], depth)
-    n, constant, rest = len(codes), arrays["constant"], arrays["directional"]
+    # A few bytes of a packed archive can describe millions of leaves: their number is compared first.
+    n, constant, rest = _count_leaves(name, arrays["tree"]), arrays["constant"], arrays["directional"]
     if arrays["density"].shape != (n,) or constant.shape != (3, n) or rest.ndim != 3 or rest.shape[1:] != (3, n):
         found = f"densities {arrays['density'].shape} and coefficients {constant.shape} and {rest.shape}"
         wanted = f"({n},), (3, {n}) and (basis - 1, 3, {n}) are expected"
         raise MivolError(f"{name} holds {found} for {n} leaves; {wanted}: write it again.")
-    check_memory(Path(name), 4 * n * (1 + 3 * (1 + len(rest))))
+    check_memory(Path(name), n * (PLACE_BYTES + 4 * COPIES * (1 + 3 * (1 + len(rest)))))
+    codes, sizes = _leaves_of(name, arrays["tree"], depth)
     density, sh = arrays["density"].astype(np.float32), np.concatenate([constant.astype(np.float32)[None], rest])
     step = arrays["step"]
     if step.any():
@@ -155,10 +156,19 @@ def parse_octree(name: str, arrays: dict[str, np.ndarray]) -> Octree:
     return Octree.from_rows(depth, arrays["to_world"], codes, sizes, density, sh, **settings)
 
 
-def _leaves_of(name: str, tree: np.ndarray, depth: int) -> tuple[np.ndarray, np.ndarray]:
-    """Codes and sizes of the leaves of the array ``tree``, in ascending order."""
+PLACE_BYTES, COPIES = 44, 3
+"""Memory of a leaf's place while it is read [bytes], measured, and copies of its values."""
+
+
+def _count_leaves(name: str, tree: np.ndarray) -> int:
+    """Leaves of the array ``tree``: its set bits; an empty one is a single leaf."""
     if tree.ndim != 2 or tree.shape[1] != 2:
         raise MivolError(f"{name} holds a tree of the shape {tree.shape}; (nodes, 2) is expected: write it again.")
+    return int(np.unpackbits(tree[:, 1].astype(np.uint8)).sum()) if len(tree) else 1
+
+
+def _leaves_of(name: str, tree: np.ndarray, depth: int) -> tuple[np.ndarray, np.ndarray]:
+    """Codes and sizes of the leaves of the array ``tree``, in ascending order."""
     if not len(tree):
         return np.zeros(1, np.uint64), np.array([depth], np.uint8)
     codes, first, found = np.zeros(1, np.uint64), 0, []
@@ -177,7 +187,10 @@ def _leaves_of(name: str, tree: np.ndarray, depth: int) -> tuple[np.ndarray, np.
         if not len(codes):
             break
     if len(codes) or first != len(tree):
-        raise MivolError(f"{name} holds a tree of {len(tree)} nodes that does not end at its leaves; write it again.")
+        raise MivolError(
+            f"{name} holds a tree of {len(tree)} nodes of which some are missing, left over or both node and leaf; "
+            f"one that ends at its leaves by depth {depth} is expected: write it again."
+        )
     all_codes, sizes = (np.concatenate(part) for part in zip(*found, strict=True))
     order = np.argsort(all_codes)
     return all_codes[order], sizes[order]
@@ -272,7 +285,9 @@ def parse_svox(name: str, arrays: dict[str, np.ndarray]) -> Octree:
         if not len(node):
             break
         if level == MAX_DEPTH:
-            raise MivolError(f"{name} holds an octree of a depth above {MAX_DEPTH}; at most {MAX_DEPTH} is expected.")
+            raise MivolError(
+                f"{name} holds an octree of a depth above {MAX_DEPTH}; at most {MAX_DEPTH} is expected: write fewer levels."
+            )
         entry = child[node]
         slot = np.arange(8)
         codes = code[:, None] * np.uint64(8) + _svox_code(slot)
@@ -280,9 +295,12 @@ def parse_svox(name: str, arrays: dict[str, np.ndarray]) -> Octree:
         leaves.append((codes[is_leaf], (8 * node[:, None] + slot)[is_leaf], level + 1))
         node, code = (node[:, None] + entry)[~is_leaf], codes[~is_leaf]
         if len(node) and (node.min() < 0 or node.max() >= len(child)):
-            raise MivolError(f"{name} names a child outside its {len(child)} nodes; write it again.")
+            wrong = node[(node < 0) | (node >= len(child))][0]
+            raise MivolError(f"{name} names node {wrong} as a child; nodes 0 to {len(child) - 1} are expected: write it again.")
         if len(np.unique(node)) < len(node) or seen[node].any():
-            raise MivolError(f"{name} holds a node with two parents or a cycle, which no octree has; write it again.")
+            raise MivolError(
+                f"{name} holds a node with two parents or a cycle; one parent for each node is expected: write it again."
+            )
         seen[node] = True
     depth = leaves[-1][2]
     codes = np.concatenate([codes << np.uint64(3 * (depth - level)) for codes, _, level in leaves])
@@ -291,7 +309,7 @@ def parse_svox(name: str, arrays: dict[str, np.ndarray]) -> Octree:
     density = np.maximum(density[rows], 0)
     kept = np.flatnonzero(density > 0)
     if not len(kept):
-        raise MivolError(f"{name} holds no leaf with a density above 0, so nothing would be seen; write it again.")
+        raise MivolError(f"{name} holds no leaf with a density above 0; at least one is expected: write it again.")
     kept = kept[np.argsort(codes[kept])]
     return Octree.from_rows(
         depth, _svox_place(name, arrays), codes[kept], sizes[kept], density[kept], sh[rows[kept]], "sigmoid", 0.0
@@ -306,7 +324,7 @@ def _svox_code(slot: np.ndarray) -> np.ndarray:
 def _svox_place(name: str, arrays: dict[str, np.ndarray]) -> np.ndarray:
     """The placement of an octree of svox."""
     if "offset" not in arrays:
-        raise MivolError(f"{name} lacks offset; an octree of svox holds it.")
+        raise MivolError(f"{name} lacks offset, which an octree of svox holds: write it again.")
     inverse, offset = arrays.get("invradius3", arrays.get("invradius")), arrays["offset"]
     if inverse.size not in (1, 3) or offset.size != 3 or not (np.isfinite(inverse).all() and np.isfinite(offset).all()):
         raise MivolError(f"{name} holds invradius {inverse.shape} and offset {offset.shape}; finite numbers are expected.")
@@ -323,7 +341,9 @@ def _svox_values(name: str, arrays: dict[str, np.ndarray], nodes: int) -> tuple[
     quantised = "quant_colors" in arrays
     needed = {"quant_map", "sigma"} if quantised else {"data"}
     if missing := needed - arrays.keys():
-        raise MivolError(f"{name} has child but lacks {', '.join(sorted(missing))}; an octree of svox holds them.")
+        raise MivolError(
+            f"{name} has child but lacks {', '.join(sorted(missing))}, which an octree of svox holds: write it again."
+        )
     found = str(arrays["data_format"]) if "data_format" in arrays else ""
     if found and not (found.startswith("SH") and found[2:].isdigit()):
         raise MivolError(f"{name} is of svox's data format {found!r}; spherical harmonics (SH1, SH4, SH9, ...) are expected.")
@@ -338,9 +358,13 @@ def _svox_values(name: str, arrays: dict[str, np.ndarray], nodes: int) -> tuple[
         density, sh = rows[:, -1], rows[:, :-1].reshape(len(rows), 3, -1).transpose(0, 2, 1)
     harmonic_degree(sh.shape[1])
     if found and int(found[2:]) != sh.shape[1]:
-        raise MivolError(f"{name} is of the data format {found} and holds {sh.shape[1]} harmonics; write it again.")
+        raise MivolError(
+            f"{name} is of the data format {found} and holds {sh.shape[1]} harmonics; {found[2:]} are expected: write it again."
+        )
     if not (np.isfinite(density).all() and np.isfinite(sh).all()):
-        raise MivolError(f"{name} holds densities or harmonics that are not finite; write it again.")
+        raise MivolError(
+            f"{name} holds densities or harmonics that are not finite; finite numbers are expected: write it again."
+        )
     return density, sh
 
 
@@ -350,9 +374,11 @@ def _quantised_values(name: str, arrays: dict[str, np.ndarray], nodes: int) -> t
     is_sound = colours.ndim == 3 and colours.shape[2] == 3 and colours.dtype.kind == "f" and places.dtype.kind in "iu"
     if not is_sound or places.shape != (len(colours), nodes, 2, 2, 2) or sigma.size != 8 * nodes or sigma.dtype.kind != "f":
         found = f"quant_colors {colours.shape}, quant_map {places.shape} and sigma {sigma.shape}"
-        raise MivolError(f"{name} holds {found} for {nodes} nodes, which do not fit together; write it again.")
+        raise MivolError(f"{name} holds {found} for {nodes} nodes; an entry for each node is expected: write it again.")
     if places.size and (int(places.max()) >= colours.shape[1] or int(places.min()) < 0):
-        raise MivolError(f"{name} names colour {places.max()} of {colours.shape[1]} in quant_colors; write it again.")
+        raise MivolError(
+            f"{name} names colour {places.max()} of quant_colors; 0 to {colours.shape[1] - 1} are expected: write it again."
+        )
     flat = places.reshape(len(colours), -1)
     sh = np.stack([colours[b].astype(np.float32)[flat[b]] for b in range(len(colours))], axis=1)
     return sigma.reshape(-1).astype(np.float32), sh

@@ -58,6 +58,13 @@ class Region:
             stride *= nodes + 1
         return dr.gather(mi.UInt8, self.occupied, place, inside) > 0
 
+    def middles(self, cells: np.ndarray) -> np.ndarray:
+        """Middles (n, 3) of cells by their numbers (n,), world."""
+        ends = [np.concatenate([[0], (np.arange(n) + 0.5) / n, [1]]) for n in self.res]
+        places = np.unravel_index(cells, [n + 1 for n in self.res])
+        unit = [0.5 * (end[place] + end[place + 1]) for end, place in zip(ends, places, strict=True)]
+        return np.stack(unit[::-1], axis=1) @ self.to_world[:3, :3].T + self.to_world[:3, 3]
+
 
 @dataclass
 class PointValues:

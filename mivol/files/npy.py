@@ -177,7 +177,9 @@ def check_arrays(name: str, arrays: dict[str, np.ndarray], expected: dict[str, t
             found = f"{key} of type {array.dtype} and shape {array.shape}"
             raise MivolError(f"{name} holds {found}; type {wanted} is expected: write it again.")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise MivolError(f"{name} holds {key} with values that are not finite; write it again.")
+            raise MivolError(
+                f"{name} holds {key} with values that are not finite; finite numbers are expected: write it again."
+            )
 
 
 def check_memory(path: Path, size: int) -> None:

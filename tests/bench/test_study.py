@@ -46,7 +46,7 @@ from mivol.errors import MivolError
 from mivol.report.figures import STYLE
 from mivol.validate.statistics import Estimate
 
-HEADER = ["size", "machine", "versions", "variant", "threads", "load_before_and_after", "seconds", "bars"]
+HEADER = ["size", "machine", "versions", "date", "variant", "threads", "load_before_and_after", "seconds", "bars"]
 
 
 @dataclass(frozen=True)
@@ -444,7 +444,8 @@ def test_the_largest_change_comes_first() -> None:
     """Numbers of the machine and of the run are not compared; the same words inside a question are."""
     before, now = {"size": "q", "a": 1.0, "b": 1.0, "c": 1.0, "d": 0.0}, {"size": "q", "a": 1.2, "b": 0.1, "c": 1.05, "d": 3.0}
     assert catalogue.find_changes(before, now) == ["b: 1 -> 0.1 (x 0.1)", "a: 1 -> 1.2 (x 1.2)"]
-    own = {"machine": {"cores": 2}, "versions": {"a": 1}, "threads": 2, "load_before_and_after": [1], "seconds": 3, "bars": [4]}
+    own = {"machine": {"cores": 2}, "versions": {"a": 1}, "date": "a", "threads": 2, "load_before_and_after": [1]}
+    own |= {"seconds": 3, "bars": [4]}
     walk = {"seconds": 2.0, "on": True, "name": "x", "costs": [1, {"machine": 5}]}
     numbers = catalogue.numbers_in(own | {"walk": walk})
     assert numbers == [("walk.seconds", 2.0), ("walk.costs.0", 1.0), ("walk.costs.1.machine", 5.0)]

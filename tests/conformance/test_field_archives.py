@@ -124,7 +124,14 @@ def test_a_nerf_is_read_as_it_was_saved(
     assert main(["convert", str(tmp_path / "f.npz"), str(tmp_path / "grid.npz"), "--to", "grid", "--resolution", "6"]) == 0
     assert "dB between views of grid.npz and f.npz" in capsys.readouterr().out
     assert main(["explain", str(tmp_path / "f.npz")]) == 0
-    assert "NerfField(2 layers x 6" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "NeRF        a network of 2 layers x 6" in said and "box         (-1, -1, -1) to (1, 1, 1) [length]" in said
+    assert "occupied    96 of 120 cells (80.0%)" in said and "samples     at most 0.25 [length] apart" in said
+    occupied = np.array(field.region.occupied) > 0
+    middles = mi.Point3f(np.ascontiguousarray(field.region.middles(np.arange(len(occupied))).T, np.float32))
+    assert np.array_equal(np.array(field.region.holds(middles)), occupied)
+    density = np.array(field.density(middles))[occupied]
+    assert f"extinction  {density.min():.4g} to {density.max():.4g} [1/length]" in said
 
 
 HOSTILE_NERFS = {

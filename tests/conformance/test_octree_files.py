@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from octrees import PLACE, random_octree
 
+from mivol import machine
 from mivol.errors import MivolError
-from mivol.fields import field_files
+from mivol.fields import field_files, octree_files
 from mivol.fields.field_files import read_field, read_grid, write_field
 from mivol.fields.octree import Octree, edges_of
 from mivol.fields.spherical_grid import SphericalGrid
+from mivol.files import npy
 
 
 def test_what_was_saved_is_read(variant_rgb: str, tmp_path: Path) -> None:
@@ -161,13 +163,13 @@ def changed(**arrays: np.ndarray) -> dict[str, np.ndarray]:
         (cyclic, "cycle"),
         (two_parents, "two parents"),
         (deep, "depth above 12"),
-        (lambda: changed(child=np.full((2, 2, 2, 2), 7, np.int32)), "outside its 2 nodes"),
+        (lambda: changed(child=np.full((2, 2, 2, 2), 7, np.int32)), "names node 7 as a child; nodes 0 to 1 are expected"),
         (lambda: changed(child=np.zeros((2, 3, 3, 3), np.int32)), r"\(nodes, 2, 2, 2\)"),
         (lambda: changed(data=np.full((2, 2, 2, 2, 13), np.nan, np.float16)), "not finite"),
         (lambda: changed(data=np.zeros((2, 2, 2, 2, 12), np.float16)), "3 basis"),
         (lambda: changed(data=np.zeros((2, 2, 2, 2, 13), np.float16)), "no leaf"),
         (lambda: changed(data_format=np.array("SG25")), "SG25"),
-        (lambda: changed(data_format=np.array("SH9")), "holds 4 harmonics"),
+        (lambda: changed(data_format=np.array("SH9")), "holds 4 harmonics; 9 are expected"),
         (lambda: changed(invradius3=np.zeros(3)), "above 0"),
         (lambda: changed(quant_colors=np.zeros((4, 8, 3), np.float16)), "lacks quant_map, sigma"),
         (
@@ -175,7 +177,7 @@ def changed(**arrays: np.ndarray) -> dict[str, np.ndarray]:
                 quant_colors=np.zeros((4, 8, 3), np.float16), quant_map=np.full((4, 2, 2, 2, 2), 9, np.uint16),
                 sigma=np.ones((2, 2, 2, 2), np.float16),
             ),
-            "colour 9 of 8",
+            "colour 9 of quant_colors; 0 to 7 are expected",
         ),
     ],
 )  # fmt: skip
@@ -189,8 +191,11 @@ def test_bad_files_of_svox_are_refused_in_a_sentence(variant_rgb: str, tmp_path:
     "change, words",
     [
         (lambda a: a.update(depth=np.array(13)), "depth 13"),
-        (lambda a: a.update(tree=a["tree"][:-1]), "does not end at its leaves"),
-        (lambda a: a.update(tree=np.concatenate([a["tree"], a["tree"]])), "does not end at its leaves"),
+        (lambda a: a.update(tree=a["tree"][:-1]), "for 391 leaves"),
+        (lambda a: a.update(tree=np.concatenate([a["tree"], np.zeros((1, 2), np.uint8)])), "ends at its leaves by depth 4"),
+        (lambda a: a["tree"].__setitem__((0, 0), 255), "ends at its leaves by depth 4 is expected"),
+        (lambda a: a["tree"].__setitem__((0, 0), 0), "ends at its leaves by depth 4 is expected"),
+        (lambda a: a.update(tree=a["tree"][:, :1]), r"shape \(96, 1\); \(nodes, 2\) is expected"),
         (lambda a: a.update(density=a["density"][:-1]), "holds densities"),
         (lambda a: a.update(step=np.array([np.nan, 1])), "not finite"),
         (lambda a: a.pop("constant"), "lacks constant"),
@@ -205,3 +210,26 @@ def test_bad_files_of_mivol_are_refused_in_a_sentence(variant_rgb: str, tmp_path
     np.savez(tmp_path / "bad.npz", **arrays)
     with pytest.raises(MivolError, match=words):
         read_field(tmp_path / "bad.npz")
+
+
+def test_leaves_beyond_the_memory_are_refused_before_they_are_made(
+    variant_rgb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A few bytes can describe millions of leaves; a large leaf beside a tiny one needs as many nodes in a grid."""
+    levels = [np.zeros((8**level, 2), np.uint8) for level in range(7)]
+    for level, bits in enumerate(levels):
+        bits[:, int(level == 6)] = 255
+    write_field(tmp_path / "t.npz", random_octree(4))
+    with np.load(tmp_path / "t.npz") as archive:
+        arrays = dict(archive)
+    monkeypatch.setattr(octree_files, "_leaves_of", lambda *arguments: pytest.fail("leaves were made"))
+    with pytest.raises(MivolError, match=r"holds densities \(395,\) .* for 2097152 leaves; \(2097152,\)"):
+        octree_files.parse_octree("t.npz", arrays | {"depth": np.array(7), "tree": np.concatenate(levels)})
+    monkeypatch.setattr(npy, "available_memory", lambda: 40_000)
+    with pytest.raises(MivolError, match="found arrays of .* GiB, expected at most the free memory"):
+        octree_files.parse_octree("t.npz", arrays)
+    monkeypatch.setattr(machine, "available_memory", lambda: 10 * 2**30)
+    codes, sizes = np.arange(7, dtype=np.uint64) * 8**8, np.array([8] * 6 + [0], np.uint8)
+    tree = Octree.from_rows(12, np.eye(4), codes, sizes, np.ones(7), np.zeros((7, 9, 3)))
+    with pytest.raises(MivolError, match="a grid of an octree of 100663297 cells needs .* GiB .*: keep it as an octree"):
+        tree.to_grid()

@@ -105,7 +105,7 @@ def arrays(**more: object) -> dict[str, np.ndarray]:
 
 
 WRONG_ARRAYS = {
-    "sh": (None, "f lacks sh; write it again."),
+    "sh": (None, "f lacks sh, which a field of mivol holds: write it again."),
     "density": (
         np.ones(7, np.float32),
         "f holds (7,) densities and (8, 1, 3) harmonics for 8 nodes; (8,) and (8, basis, 3) are expected: write it again.",
@@ -115,7 +115,7 @@ WRONG_ARRAYS = {
         "f holds to_world of type float64 and shape (3, 3); type float and shape (4, 4) is expected: write it again.",
     ),
     "activation": (1, "f holds activation of type int64 and shape (); type text and shape () is expected: write it again."),
-    "offset": (np.nan, "f holds offset with values that are not finite; write it again."),
+    "offset": (np.nan, "f holds offset with values that are not finite; finite numbers are expected: write it again."),
     "res": ((2, 0, 2), f"f has a grid of 2 x 0 x 2 nodes; 1 to {MAX_NODES} in all are expected."),
     "levels": (-1, f"f has a grid of -1 x 2 x 2 x 2 nodes; 1 to {MAX_NODES} in all are expected."),
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,13 @@ from ball_photos import WHITE, ball, camera
 from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments.octree_fit import make_octree_plan, read_start
+from mivol.experiments.octree_fit import NETWORKS, find_preset, make_network_plan, make_octree_plan, read_start
 from mivol.fields.field_files import read_field, write_field
 from mivol.fields.octree import Octree
 from mivol.files import decode_srgb, write_png
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import PRESETS
+from mivol.optim.photographs.sampled_problem import PRESETS as SAMPLED
 from mivol.photos.transforms import write_transforms
 
 
@@ -54,6 +56,22 @@ def toml(folder: Path, field: str, photos: str = 'background = "white"') -> Path
     return path
 
 
+@pytest.mark.parametrize("start", ["hash", "nerf"])
+def test_the_first_level_is_a_network_of_its_preset(
+    photographs: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, start: str
+) -> None:
+    """``mivol explain`` describes the network; a run counts its time, and a continued one keeps it."""
+    path = toml(photographs, f'start = "{start}"\npreset = "tiny"\neffort = 0.01\nsteps = 100\ndepth = 4')
+    assert main(["explain", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert "steps: traced in each step" in said and "refused" not in said
+    tiny = SAMPLED[start]["tiny"]
+    assert make_network_plan(config.load(path)) == replace(tiny, steps=max(1, round(tiny.steps * 0.01)))
+    with pytest.raises(MivolError, match='"cpu" is no preset of the (hash|nerf) network: choose one of tiny'):
+        make_octree_plan(config.load(toml(photographs, f'start = "{start}"\npreset = "cpu"')))
+    assert find_preset(config.load(toml(photographs, f'start = "{start}"')).field) == NETWORKS[start]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "field, names",
@@ -78,6 +96,13 @@ def test_stages_stand_on_the_page(photographs: Path, field: str, names: list[str
     before, after = (float(row[2]) for row in rows[-2:])
     # Rounded values are read again for both.
     assert after > before - 0.5
+    times, network = json.loads((run / "run.json").read_text())["timings"], rows[0]
+    assert ("hash grid" in times) == (network[0] == "hash grid")
+    if network[0] == "hash grid":
+        assert int(network[-1]) <= times["hash grid"] + 1 and int(network[-1]) <= int(rows[-1][-1])
+        assert main(["optimize", str(photographs / "fit.toml"), "-o", str(run), "--resume"]) == 0
+        assert json.loads((run / "stages" / "stages.json").read_text())[0] == network
+        assert "hash grid" in json.loads((run / "run.json").read_text())["timings"]
 
 
 def test_an_octree_needs_one_box_and_a_known_background(photographs: Path) -> None:

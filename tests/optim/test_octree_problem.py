@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from ball_photos import BOX, CUBE, PLAN, WHITE, ball, camera, error_of, photo
 
+from mivol import machine
 from mivol.errors import MivolError
 from mivol.fields.field_files import write_field
 from mivol.fields.hash_encoding import HashSizes
@@ -153,7 +154,9 @@ def test_resumed_fit_equals_an_uninterrupted_fit(one_thread, photos: list[Photo]
     assert [row["loss"] for row in resumed.history] == [row["loss"] for row in whole.history]
 
 
-def test_grids_that_no_octree_shows_are_refused(variant_rgb: str, photos: list[Photo], tmp_path: Path) -> None:
+def test_grids_that_no_octree_shows_are_refused(
+    variant_rgb: str, photos: list[Photo], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rays = looks(RayBatches.from_photos(photos))
     shear = CUBE.copy()
     shear[0, 1] = 1.0
@@ -170,3 +173,6 @@ def test_grids_that_no_octree_shows_are_refused(variant_rgb: str, photos: list[P
     write_field(tmp_path / "grid.npz", ball(8))
     with pytest.raises(MivolError, match="depth 13"):
         build_octree(ball(8), rays, OctreeRecipe(depth=13))
+    monkeypatch.setattr(machine, "available_memory", lambda: 2**20)
+    with pytest.raises(MivolError, match=r"an octree of \d+ leaves at depth 6 needs .* GiB .*: choose a smaller depth"):
+        build_octree(ball(8), rays, OctreeRecipe(depth=6, keep_weight=0.0))

@@ -160,5 +160,5 @@ def numbers_in(tree: object, prefix: str = "") -> list[tuple[str, float]]:
     if isinstance(tree, int | float):
         return [(prefix, float(tree))]
     items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
-    skipped = ("machine", "versions", "threads", "load_before_and_after", "seconds", "bars") if not prefix else ()
+    skipped = ("machine", "versions", "date", "threads", "load_before_and_after", "seconds", "bars") if not prefix else ()
     return [pair for key, value in items if key not in skipped for pair in numbers_in(value, f"{prefix}.{key}".lstrip("."))]

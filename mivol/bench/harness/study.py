@@ -257,6 +257,7 @@ def header(size: str, variant: str, load: float | None, start: float) -> dict:
         "size": size,
         "machine": msgspec.to_builtins(describe_machine()),
         "versions": package_versions(),
+        "date": time.strftime("%Y-%m-%d"),
         "variant": variant,
         "threads": dr.thread_count(),
         "load_before_and_after": [load, mean_load()],

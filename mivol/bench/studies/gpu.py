@@ -1,7 +1,7 @@
 """How good and how fast are hash grids and NeRFs on a GPU?
 
     mivol bench gpu --variant cuda_ad_rgb    # a quarter of an hour; the JSON names the card and the date
-    mivol bench gpu --quick                  # under a minute on any machine: the figures mean nothing
+    mivol bench gpu --quick                  # a minute on any machine: the figures mean nothing
 
 samples: rate of a hash grid with the sizes of the preset ``gpu``, forward and backward with all derivatives, at points along
 rays. hash, nerf: the chair of NeRF-synthetic (from MIVOL_DATA) at 800 pixels, 100 photographs, presets ``gpu`` with as many

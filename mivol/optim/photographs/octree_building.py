@@ -28,6 +28,7 @@ from mivol.fields.octree import MAX_DEPTH, MAX_LEAVES, Octree, check_depth, inte
 from mivol.fields.resampling import project_colours, sample_voxels
 from mivol.fields.sampled_field import SampledField
 from mivol.fields.spherical_grid import SphericalGrid
+from mivol.machine import check_memory
 from mivol.space import place_grid
 from mivol.transport.line_integrals.leaf_radiance import LeafColours, raise_leaf_weights
 from mivol.transport.line_integrals.radiance_field import RayBundle
@@ -78,17 +79,14 @@ def build_octree(grid: SphericalGrid, rays: ViewRays, recipe: OctreeRecipe = Oct
     if not len(cells):
         raise MivolError(NO_MATTER)
     for level in range(base + 1, depth + 1):
-        if level > base + 1:
+        is_finer = level > base + 1
+        _check_leaves(len(cells) * (8 if is_finer else 1), level)
+        if is_finer:
             cells = (2 * cells[:, None] + np.array([*itertools.product((0, 1), repeat=3)])).reshape(-1, 3)
-        if len(cells) > MAX_LEAVES:
-            raise MivolError(
-                f"an octree of {len(cells)} leaves at depth {level} was asked for; at most {MAX_LEAVES} are expected: "
-                "choose a smaller depth."
-            )
         tree = _sample(grid, base, level, cells, with_colours=False)
         cells = separate(tree.codes, level)
         weights = max_weights(tree, rays)
-        if level > base + 1:
+        if is_finer:
             # Leaves smaller than pixels lie between the rays: what a ray meets in a sibling counts for all eight.
             weights = _largest_of_siblings(tree.codes, weights)
         seen = weights >= recipe.keep_weight
@@ -175,6 +173,7 @@ def build_octree_of_points(
     low = field.to_world[:3, 3]
     res, place = place_grid(np.array([low, low + field.edges]), 2**depth)
     nodes, density, middles = sample_voxels(field, res, place)
+    _check_leaves(len(nodes), depth)
     cells = np.stack([nodes % res[2], nodes // res[2] % res[1], nodes // (res[2] * res[1])], axis=1)
     codes = interleave(cells, depth)
     order = np.argsort(codes)
@@ -192,6 +191,18 @@ def build_octree_of_points(
         raise MivolError(f"no view shows matter in the {field.noun}: check the box, the cameras and the threshold.")
     tree = make(kept, project_colours(field, middles[kept], degree))
     return merge_siblings(tree, weights[kept], recipe.tolerance)
+
+
+LEAF_BYTES = 200
+"""Memory of a leaf while an octree is made [bytes]: its cell, code and order, values without colours, and weight."""
+
+
+def _check_leaves(count: int, depth: int) -> None:
+    """Refuse more leaves than an octree or the memory holds."""
+    wanted = f"an octree of {count} leaves at depth {depth}"
+    if count > MAX_LEAVES:
+        raise MivolError(f"{wanted} was asked for; at most {MAX_LEAVES} are expected: choose a smaller depth.")
+    check_memory(LEAF_BYTES * count, wanted, "choose a smaller depth")
 
 
 def _check_grid(grid: SphericalGrid, recipe: OctreeRecipe) -> int:
