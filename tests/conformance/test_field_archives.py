@@ -130,6 +130,8 @@ def test_a_nerf_is_read_as_it_was_saved(
     occupied = np.array(field.region.occupied) > 0
     middles = mi.Point3f(np.ascontiguousarray(field.region.middles(np.arange(len(occupied))).T, np.float32))
     assert np.array_equal(np.array(field.region.holds(middles)), occupied)
+    # The first cells are half as long as the others: 0.1, 1/8 and 1/6 of the box with 5, 4 and 3 nodes.
+    assert field.region.middles(np.array([0, 1])) == pytest.approx(np.array([[-0.9, -7 / 8, -5 / 6], [-0.6, -7 / 8, -5 / 6]]))
     density = np.array(field.density(middles))[occupied]
     assert f"extinction  {density.min():.4g} to {density.max():.4g} [1/length]" in said
 
