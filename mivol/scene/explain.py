@@ -22,11 +22,8 @@ from mivol.scene.nesting import shape_bounds
 from mivol.scene.plan import Plan, build_media, make_plan
 from mivol.scene.previews import (
     find_sufficient_depth,
-    measure_branch_noise,
     measure_emitter_noise,
-    measure_lamp_noise,
-    measure_media_light,
-    measure_near_light,
+    measure_noise,
 )
 from mivol.scene.render_tasks import find_unrecorded
 from mivol.scene.sensors import check_film, find_sensor
@@ -105,10 +102,7 @@ def explain_scene(
     try:
         check_film(eye)
         make_plan(needs, settings)
-        needs = measure_media_light(scene, eye, needs, survey, settings)
-        needs = measure_near_light(scene, eye, needs, survey, settings)
-        needs = measure_lamp_noise(scene, eye, needs, survey, settings)
-        needs = measure_branch_noise(scene, eye, needs, survey, settings)
+        needs = measure_noise(scene, eye, needs, survey, settings, for_images=True)
         shares = measure_emitter_noise(scene, eye, needs, survey, settings)
         return Explanation((*facts, *_describe_plan(scene, eye, needs, settings, noise, shares)))
     except MivolError as error:
@@ -225,7 +219,7 @@ def _describe_light_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Se
     """Cost and measured bias of a transmittance grid in place of shadow rays."""
     if not is_scattering_visible(needs, settings) or set(needs.emitter_kinds) != {"delta"} or len(needs.media) != 1:
         return []
-    if not shares_cells(needs) or any(part.lattice is None for part in needs.views[0].parts):
+    if not shares_cells(needs.views[0]) or any(part.lattice is None for part in needs.views[0].parts):
         return []
     with dr.suspend_grad():
         media, emitters = build_media(scene, needs, plan, survey_scene(scene)), SceneEmitters(scene)

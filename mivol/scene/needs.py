@@ -33,6 +33,7 @@ from mivol.scene.survey import (
     OUTSIDE_SHAPES,
     Boundary,
     BranchNoise,
+    EmissionNoise,
     SceneSurvey,
     ShapeFacts,
     find_outside_media,
@@ -355,6 +356,8 @@ class Needs(ShapeFacts):
             before a measurement.
         lamp_noise: measured variances, for one sample of a pixel, of the light of lamps seen directly and of all other light;
             None before a measurement.
+        emission_noise: what a preview measures of the light of media seen directly (:class:`EmissionNoise`); None before a
+            measurement.
         branch_noise: what a preview measures of paths that branch (:class:`BranchNoise`); None before a measurement.
         media_light: the light that media emit; None without such light, without scattering, or if the light could not be read.
     """
@@ -374,6 +377,7 @@ class Needs(ShapeFacts):
     emitter_distances: tuple[float, ...] = ()
     near_gain: float | None = None
     lamp_noise: tuple[float, float] | None = None
+    emission_noise: EmissionNoise | None = None
     branch_noise: BranchNoise | None = None
     media_light: MediaLight | None = None
 

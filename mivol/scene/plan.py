@@ -7,7 +7,7 @@ runs.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -22,6 +22,7 @@ from mivol.scene.choices import (
     choose_branches,
     choose_channels,
     choose_emission,
+    choose_emission_rays,
     choose_flights,
     choose_image_branches,
     choose_lamp_rays,
@@ -117,6 +118,7 @@ class Plan:
         are_thick: whether collisions alone find the derivatives of each medium's extinction.
         have_low_albedo: whether some albedo of each medium may be too low for derivatives to be found at collisions.
         shadow_nodes: nodes along an edge of the table of shadows, in images; 0 for shadow rays.
+        emission_rays: own camera rays of a pixel for the light of media that does not scatter, in images; 0 for none.
         lamp_rays: own camera rays a sample for the light of lamps seen directly, in images; 0 for none.
         occupied: share of occupied blocks of the first medium's grid, in steps of ``OCCUPIED_STEP`` [1]; None if unknown.
     """
@@ -142,12 +144,19 @@ class Plan:
     occupied: float | None = None
     lamp_rays: int = 0
     shadow_nodes: int = 0
+    emission_rays: int = 0
 
     @property
     def decisions(self) -> tuple:
         """All that a kernel depends on, without the reasons: equal plans give the same kernels."""
         skipped = {"choices", "gradient_bytes"}
         return tuple(value for name, value in vars(self).items() if name not in skipped)
+
+    def light_of_paths(self, estimators: Estimators) -> Estimators:
+        """The estimators of the light without camera rays of its own."""
+        if self.lamp_rays:
+            estimators = replace(estimators, shows="rest")
+        return replace(estimators, camera_emission=0.0) if self.emission_rays else estimators
 
     def readings(self, for_images: bool) -> tuple:
         """All that decides what is read of the values of media (:func:`read_parts`)."""
@@ -221,6 +230,8 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     choices += why
     lamp_rays, why = choose_lamp_rays(needs, settings)
     choices += why
+    emission_rays, why = choose_emission_rays(needs, settings, segment)
+    choices += why
     nodes, why = choose_shadow_table(needs, settings, segment)
     choices += why
     return Plan(
@@ -245,6 +256,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         _round_occupied(needs),
         lamp_rays,
         nodes,
+        emission_rays,
     )
 
 

@@ -26,6 +26,9 @@ path hits a light found by sampling, the difference of the means stands for the 
 drawn on each segment. The gain is the sum of the variances of all cells with collisions, over c times their sum with distances:
 the noise of collisions near an emitter is large in few cells.
 
+**Emission in view.** :func:`measure_emission_noise` measures the variance of pixels with and without the light that media emit
+towards the camera, and of this light along camera rays of its own.
+
 **Branches.** :func:`measure_branch_noise` measures the variance of pixels with one and with several branches of a path. With k
 branches it is A + B / k, so two numbers of branches tell the noise A of stems and B of branches.
 
@@ -45,11 +48,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mivol.kernel_recording import is_recording, without_garbage_collection
-from mivol.scene.choices import is_branch_noise_open, is_lamp_noise_open, is_near_light_open
+from mivol.scene.choices import (
+    is_branch_noise_open,
+    is_emission_noise_open,
+    is_lamp_noise_open,
+    is_near_light_open,
+)
 from mivol.scene.media_light import SAMPLING_COST
 from mivol.scene.needs import Needs, find_needs
 from mivol.scene.plan import Plan, build_estimators, choose_segment, make_plan
-from mivol.scene.survey import BranchNoise, SceneSurvey, survey_scene
+from mivol.scene.survey import BranchNoise, EmissionNoise, SceneSurvey, survey_scene
 from mivol.scene_graph import traverse
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.path.estimators import Estimators, Settings
@@ -247,6 +255,52 @@ def last_order_share(whole: NDArray, shorter: NDArray) -> tuple[float, float]:
     return float(share), float((last - share * full).std(ddof=1) / (math.sqrt(len(full)) * full.mean()))
 
 
+def measure_noise(
+    scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings, for_images: bool
+) -> Needs:
+    """Measure all that the plan of an image, or of derivatives, decides by noise; each preview knows the ones before.
+
+    Arguments as for :func:`measure_media_light`.
+
+    Returns:
+        The needs with what was measured.
+    """
+    measures = [measure_media_light, measure_near_light]
+    if for_images:
+        measures = [measure_emission_noise, *measures, measure_lamp_noise, measure_branch_noise]
+    for measure in measures:
+        needs = measure(scene, sensor, needs, survey, settings)
+    return needs
+
+
+def measure_emission_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> Needs:
+    """Measure the noise of the light that media emit towards the camera, by paths and by camera rays of its own.
+
+    Arguments as for :func:`measure_media_light`; ``survey`` keeps the variances of each sensor.
+
+    Returns:
+        The needs with the variances.
+
+    Cost: 2 x 16384 paths once, and a kernel; if paths have less noise without this light, 16384 camera rays and another kernel.
+    """
+    # A camera of several views is not measured: Mitsuba's keeps arrays that recordings do not know.
+    if sensor.class_name() == "BatchSensor" or is_recording():
+        return needs
+    if not is_emission_noise_open(needs, settings, choose_segment(needs, settings)):
+        return needs
+    if sensor.ptr not in survey.emission_noise:
+        with without_garbage_collection(), dr.suspend_grad():
+            estimators = build_estimators(scene, needs, make_plan(needs, settings), settings, survey, for_images=True)
+            # The weight is an argument of one kernel.
+            paths, rest = (
+                _measure_pixel_variance(sensor, replace(estimators, camera_emission=dr.opaque(mi.Float, weight)))
+                for weight in (1, 0)
+            )
+            rays = _measure_pixel_variance(sensor, estimators.of_camera_emission()) if rest < paths else 0.0
+        survey.emission_noise[sensor.ptr] = EmissionNoise(paths, rest, rays)
+    return replace(needs, emission_noise=survey.emission_noise[sensor.ptr])
+
+
 DRAW_SIDE, DRAW_SAMPLES = 24, 48
 """Cells along an edge of the emission preview, and samples per cell."""
 
@@ -318,9 +372,10 @@ def measure_lamp_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey:
         return needs
     if sensor.ptr not in survey.lamp_noise:
         with without_garbage_collection(), dr.suspend_grad():
-            estimators = build_estimators(scene, needs, make_plan(needs, settings), settings, survey, for_images=True)
+            plan = make_plan(needs, settings)
+            estimators = plan.light_of_paths(build_estimators(scene, needs, plan, settings, survey, for_images=True))
             edge = _measure_pixel_variance(sensor, estimators.of_lamps())
-            rest = _measure_pixel_variance(sensor, estimators.without_lamps()) if edge > 0 else 0.0
+            rest = _measure_pixel_variance(sensor, replace(estimators, shows="rest")) if edge > 0 else 0.0
         survey.lamp_noise[sensor.ptr] = (edge, rest)
     return replace(needs, lamp_noise=survey.lamp_noise[sensor.ptr])
 
@@ -348,9 +403,7 @@ def measure_branch_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, surve
         with without_garbage_collection(), dr.suspend_grad():
             plan = make_plan(needs, settings)
             estimators = build_estimators(scene, needs, plan, settings, survey, for_images=True)
-            survey.branch_noise[sensor.ptr] = _measure_branches(
-                sensor, estimators.without_lamps() if plan.lamp_rays else estimators
-            )
+            survey.branch_noise[sensor.ptr] = _measure_branches(sensor, plan.light_of_paths(estimators))
     return replace(needs, branch_noise=survey.branch_noise[sensor.ptr])
 
 
@@ -470,7 +523,8 @@ def sampling_gain(met: NDArray, drawn: NDArray) -> float:
 
 def _render_draw_preview(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> NDArray:
     """Mean radiance over all colours of each sample (cells, DRAW_SAMPLES), along the middle of each cell."""
-    estimators = build_estimators(scene, needs, make_plan(needs, settings), settings, survey, for_images=True)
+    plan = make_plan(needs, settings)
+    estimators = plan.light_of_paths(build_estimators(scene, needs, plan, settings, survey, for_images=True))
     return _walk_cells(sensor, estimators, DRAW_SIDE, DRAW_SAMPLES)
 
 

@@ -96,7 +96,7 @@ def check_quadrature(needs: Needs, settings: Settings) -> None:
             f"deterministic is set and the scene has a {other[0]}; quadrature is for emitters of one position or direction "
             "(point, spot, directional): leave deterministic out."
         )
-    if len(needs.media) > 1 or not shares_cells(needs):
+    if len(needs.media) > 1 or not shares_cells(needs.views[0]):
         grids = sum(len(m.resolutions) for m in needs.media)
         raise MivolError(
             f"deterministic is set and the scene has {len(needs.media)} media with {grids} grids of extinction; quadrature is "

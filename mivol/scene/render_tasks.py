@@ -7,6 +7,7 @@ recording reads the arrays of that call.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -166,16 +167,13 @@ class ImageTask(RenderTask):
         super().__init__(*given, for_images=True)
 
     def __call__(self, scene: mi.Scene, sensor: mi.Sensor, arrays: PreparedArrays, seed: mi.UInt32) -> mi.TensorXf:
-        estimators, own = self.build_estimators(scene, arrays), None
-        if self.plan.lamp_rays:
-            lamps, estimators = estimators.of_lamps(), estimators.without_lamps()
-            own = LightOfOwnRays(self.plan.lamp_rays, lambda rays: _walk_paths(lamps, rays)[0])
-        return render_on_film(
-            self.samples(sensor, arrays, seed),
-            self.aovs,
-            lambda rays: _render_primal(estimators, rays, self.plan, self.aovs),
-            own,
-        )
+        samples, plan, estimators = self.samples(sensor, arrays, seed), self.plan, self.build_estimators(scene, arrays)
+        spp = self.spp or sensor.sampler().sample_count()
+        own = [(spp * plan.lamp_rays, estimators.of_lamps)] if plan.lamp_rays else []
+        own += [(plan.emission_rays, estimators.of_camera_emission)] if plan.emission_rays else []
+        lights = [LightOfOwnRays(count, partial(_find_radiance, find())) for count, find in own]
+        estimators = plan.light_of_paths(estimators)
+        return render_on_film(samples, self.aovs, lambda rays: _render_primal(estimators, rays, plan, self.aovs), lights)
 
 
 class GradientTask(RenderTask):
@@ -230,6 +228,11 @@ def _render_primal(estimators: Estimators, rays: CameraRays, plan: Plan, aovs: l
     else:
         L, alpha = _walk_paths(estimators, rays)
     return L, alpha, integrate_aovs(estimators.media, rays.ray, aovs)
+
+
+def _find_radiance(estimators: Estimators, rays: CameraRays) -> mi.Spectrum:
+    """Radiance of one path for each ray."""
+    return _walk_paths(estimators, rays)[0]
 
 
 def _walk_paths(estimators: Estimators, rays: CameraRays) -> tuple[mi.Spectrum, mi.Float]:

@@ -24,13 +24,7 @@ from mivol.errors import MivolError
 from mivol.kernel_recording import CannotRecordError, Recordings, is_recording, without_garbage_collection
 from mivol.scene.needs import find_needs, warn_of_clipped_view, warn_of_misplaced_grids
 from mivol.scene.plan import make_plan, read_parts
-from mivol.scene.previews import (
-    measure_branch_noise,
-    measure_lamp_noise,
-    measure_media_light,
-    measure_near_light,
-    warn_of_last_order,
-)
+from mivol.scene.previews import measure_noise, warn_of_last_order
 from mivol.scene.readings import release_unread
 from mivol.scene.refusals import parse_aovs
 from mivol.scene.render_tasks import (
@@ -272,11 +266,7 @@ class Session:
         warn_of_misplaced_grids(needs, survey)
         warn_of_clipped_view(needs, sensor, survey)
         with dr.suspend_grad():
-            needs = measure_media_light(scene, sensor, needs, survey, self.settings)
-            needs = measure_near_light(scene, sensor, needs, survey, self.settings)
-            if for_images:
-                needs = measure_lamp_noise(scene, sensor, needs, survey, self.settings)
-                needs = measure_branch_noise(scene, sensor, needs, survey, self.settings)
+            needs = measure_noise(scene, sensor, needs, survey, self.settings, for_images)
         plan = make_plan(needs, self.settings, self.aovs)
         if not self.is_depth_given:
             warn_of_last_order(scene, sensor, needs, plan, survey, self.settings)

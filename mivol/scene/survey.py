@@ -51,6 +51,21 @@ class BranchNoise:
     events: float
 
 
+@dataclass(frozen=True)
+class EmissionNoise:
+    """What a preview measures of the light that media emit towards the camera: variances in a pixel, for one sample.
+
+    Attributes:
+        paths: of all light, by paths alone.
+        rest: of the light of paths without this light.
+        rays: of this light, summed along camera rays.
+    """
+
+    paths: float
+    rest: float
+    rays: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class ShapeFacts:
     """The facts about shapes and emitters.
@@ -106,6 +121,7 @@ class SceneSurvey:
             measurement.
         near_gain: measured gain of drawing the light of near emitters along segments [1]; None before a measurement.
         lamp_noise: measured variances of the light of lamps seen directly, and of all other light, by sensor.
+        emission_noise: what previews have measured of the light of media seen directly, by sensor.
         branch_noise: what previews have measured of branching paths, by sensor.
     """
 
@@ -128,6 +144,7 @@ class SceneSurvey:
     gain_of_draws: float | None = None
     near_gain: float | None = None
     lamp_noise: dict[int, tuple[float, float]] = field(default_factory=dict)
+    emission_noise: dict[int, EmissionNoise] = field(default_factory=dict)
     branch_noise: dict[int, BranchNoise] = field(default_factory=dict)
 
     @property

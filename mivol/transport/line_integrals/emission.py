@@ -17,14 +17,16 @@ References: Max 1995 (the emission-absorption integral).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.transport.estimators.scores import FORWARD
+from mivol.numerics import minimum, one_minus_exp
+from mivol.transport.estimators.scores import FORWARD, IMAGE
 from mivol.transport.estimators.segment import PathSegment, SegmentEstimate, SegmentLight, SegmentTransmittance
 from mivol.transport.line_integrals.composite import Composite, composite_ray, vjp_composite
 from mivol.transport.line_integrals.integrand import LineIntegral, RayPiece
@@ -36,7 +38,8 @@ from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.media.ray_intervals import RaySegment, find_end
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.cell_quadrature import share_opacity, weigh_emission_density
-from mivol.transport.traversal.interpolation import GAUSS_POINT
+from mivol.transport.traversal.interpolation import GAUSS_POINT, eval_cubic, fit_cubic, integrate_cubic
+from mivol.transport.traversal.random_numbers import SpreadSampler
 
 __all__ = ["integrate_emission", "vjp_emission", "Emission"]
 
@@ -45,7 +48,13 @@ OPAQUE_DEPTH = 1000.0
 """Redistances an infinite optical depth: exp(-1000) is 0."""
 
 
-def integrate_emission(media: SceneMedia, ray_segment: RaySegment, active: mi.Bool, tangent: bool = False) -> Composite:
+THIN_CELL = 1e-3
+"""Half the optical depth of a cell [1] below which random points are uniform in it."""
+
+
+def integrate_emission(
+    media: SceneMedia, ray_segment: RaySegment, active: mi.Bool, tangent: bool = False, u: mi.Float | None = None
+) -> Composite:
     """Integrate the emitted light of media along a ray.
 
     Args:
@@ -53,6 +62,7 @@ def integrate_emission(media: SceneMedia, ray_segment: RaySegment, active: mi.Bo
         ray_segment: ray and length; world space, unit direction.
         active: lanes to follow.
         tangent: whether to follow tangents, which the media took from the parameters.
+        u: uniform random number in [0, 1) of each ray, which places the points in cells; None for the quadrature.
 
     Returns:
         The composite: ``N`` is the light of each colour [radiance], ``tau`` the optical depth; tangents follow.
@@ -61,10 +71,12 @@ def integrate_emission(media: SceneMedia, ray_segment: RaySegment, active: mi.Bo
         MivolError: a medium whose grids of extinction do not share their cells.
 
     Bias: of order dt^4 in the length of a part of a cell; none for a constant source function. A box of emission that ends
-        inside of cells is met to a part of a cell.
+        inside of cells is met to a part of a cell. With ``u`` none, but of an extinction with an activation, which a cubic
+        through four points of a cell stands for.
     Cost: a walk of each medium, and two look-ups of the emission in a part of a cell.
     """
-    line = LineIntegral(media, _EmissionIntegrand.of(media), ray_segment, active)
+    integrand = _EmissionIntegrand.of(media) if u is None else _SampledIntegrand(**vars(_EmissionIntegrand.of(media)), u=u)
+    line = LineIntegral(media, integrand, ray_segment, active)
     return composite_ray(line, [mi.Float(0)] * line.integrand.rows, tangent, skip=not tangent)
 
 
@@ -109,7 +121,7 @@ class _EmissionIntegrand:
         return tuple((part + p) / self.parts for part in range(self.parts) for p in (GAUSS_POINT, 1 - GAUSS_POINT))
 
     def integrate_cell(self, piece: RayPiece, sigma: list[list[mi.Float]]) -> list[CellIntegral]:
-        source, emission_density = self._detached(piece)
+        source, emission_density = self._detached(piece, self.points)
         dt = piece.dt / self.parts
         cells = []
         for part in range(self.parts):
@@ -141,7 +153,7 @@ class _EmissionIntegrand:
         finite = dr.isfinite(piece.dt)
         near = RayPiece(piece.body, piece.ray, piece.a, dr.select(finite, piece.dt, 0), piece.on)
         integrals = self.integrate_cell(near, [[s] * len(self.points) for s in sigma])
-        source, emission_density = self._detached(near)
+        source, emission_density = self._detached(near, self.points[:1])
         return [
             _extend_to_infinity(
                 integral,
@@ -164,7 +176,7 @@ class _EmissionIntegrand:
                 dr.backward_from(dr.select(piece.on, factor * light, 0))
         if body.view.emission is None or body.view.albedo is not None:
             return
-        for t, per in zip(self._point_distances(piece), per_sigma, strict=True):
+        for t, per in zip(_point_distances(piece, self.points), per_sigma, strict=True):
             Le, fraction = self._emitted(piece, t)
             for name, by in (("sigma_a", 1 - fraction), ("sigma_s", -fraction)):
                 rows = factor * per * Le * by
@@ -179,7 +191,7 @@ class _EmissionIntegrand:
             light = self._cell_light(piece, by_source, by_density)
             change = take_tangent(light)
         if body.view.emission is not None and body.view.albedo is None:
-            for t, per in zip(self._point_distances(piece), per_sigma, strict=True):
+            for t, per in zip(_point_distances(piece, self.points), per_sigma, strict=True):
                 Le, fraction = self._emitted(piece, t)
                 by_a, by_s = (
                     to_spectrum(body.jvp_extinction_at(piece.ray, t, self.channels, piece.on, name))
@@ -191,14 +203,9 @@ class _EmissionIntegrand:
     def lower_bound(self, t1: mi.Float) -> float:
         return 0.0
 
-    def _point_distances(self, piece: RayPiece) -> list[mi.Float]:
-        """Distances of the points of a cell."""
-        dt = dr.select(dr.isfinite(piece.dt), piece.dt, 0)
-        return [dr.fma(dt, p, piece.a) for p in self.points]
-
-    def _detached(self, piece: RayPiece) -> tuple[list[mi.Spectrum], list[mi.Spectrum]]:
-        """Source function and emission density at the points; an empty list if the medium has none."""
-        view, distances = piece.body.view, self._point_distances(piece)
+    def _detached(self, piece: RayPiece, points: Sequence[mi.Float | float]) -> tuple[list[mi.Spectrum], list[mi.Spectrum]]:
+        """Source function and emission density at points of a piece; an empty list if the medium has none."""
+        view, distances = piece.body.view, _point_distances(piece, points)
         source, emission_density = [], []
         if view.emission is not None:
             source = [dr.detach(self._source(piece, t) * self._absorbed_fraction(piece, t)) for t in distances]
@@ -248,7 +255,7 @@ class _EmissionIntegrand:
 
     def _cell_light(self, piece: RayPiece, by_source: list, by_density: list) -> mi.Spectrum:
         """The light of a cell, attached to emission and albedo."""
-        total, distances = mi.Spectrum(0), self._point_distances(piece)
+        total, distances = mi.Spectrum(0), _point_distances(piece, self.points)
         if piece.body.view.emission is not None:
             total += sum(
                 (
@@ -264,6 +271,57 @@ class _EmissionIntegrand:
                 )
             )
         return total
+
+
+@dataclass
+class _SampledIntegrand(_EmissionIntegrand):
+    """The same integrand at random points of each cell, for images without bias.
+
+    The extinction is the cubic through four points of the cell. The points are antithetic in pairs, with a density in
+    proportion to exp(-tau x / 2) and the optical depth tau of the cell in its clearest channel. Without the half, a cell whose
+    extinction grows from 0 would have large weights behind its middle.
+
+    Attributes:
+        u: uniform random number in [0, 1) of each ray.
+    """
+
+    u: mi.Float
+
+    @property
+    def points(self) -> tuple[float, ...]:
+        """The points of a cubic."""
+        return 0.0, 1 / 3, 2 / 3, 1.0
+
+    def integrate_cell(self, piece: RayPiece, sigma: list[list[mi.Float]]) -> list[CellIntegral]:
+        dt, curves, count = piece.dt, [fit_cubic(*row) for row in sigma[: self.channels]], 2 * self.parts
+        tau = [integrate_cubic(curve, dt, mi.Float(1)) for curve in curves]
+        thinnest = 0.5 * minimum(tau)
+        opacity, is_thin = one_minus_exp(thinnest), thinnest < THIN_CELL
+        places, weights = [], []
+        for number in range(count):
+            v = (number + (1 - self.u if number % 2 else self.u)) / count
+            left = 1 - v * opacity
+            places.append(dr.select(is_thin, v, dr.minimum(-dr.log(left) / dr.select(is_thin, 1, thinnest), 1)))
+            weights.append(dt / count * dr.select(is_thin, 1, opacity / dr.select(is_thin, 1, thinnest * left)))
+        source, emission_density = self._detached(piece, places)
+        integrals = []
+        for r in range(self.rows):
+            curve, N = curves[r % self.channels], mi.Float(0)
+            for k, (x, weight) in enumerate(zip(places, weights, strict=True)):
+                light = mi.Float(0)
+                if source:
+                    light += dr.maximum(eval_cubic(curve, x), 0) * source[k][r]
+                if emission_density:
+                    light += emission_density[k][r]
+                N += weight * dr.exp(-integrate_cubic(curve, dt, x)) * light
+            integrals.append(CellIntegral(tau[r % self.channels], dr.exp(-tau[r % self.channels]), N, [], []))
+        return integrals
+
+
+def _point_distances(piece: RayPiece, points: Sequence[mi.Float | float]) -> list[mi.Float]:
+    """Distances of points of a piece, which are given as fractions of its length."""
+    dt = dr.select(dr.isfinite(piece.dt), piece.dt, 0)
+    return [dr.fma(dt, p, piece.a) for p in points]
 
 
 def _join_parts(parts: list[CellIntegral]) -> CellIntegral:
@@ -319,16 +377,21 @@ def _group_by_point(pairs: list[tuple[mi.Float, mi.Float]], ahead: list[mi.Float
 class Emission:
     """The segment estimator for media that emit and absorb, without scattering.
 
-    Bias and cost: as :func:`integrate_emission`. Variance: none.
+    Args:
+        media: media of the scene.
+        is_sampled: the points in cells are random, for images without bias; other purposes have the quadrature.
+
+    Bias and cost: as :func:`integrate_emission`. Variance: none, or the random points in cells.
     """
 
     ends_in_media = False
 
-    def __init__(self, media: SceneMedia) -> None:
-        self.media = media
+    def __init__(self, media: SceneMedia, is_sampled: bool = False) -> None:
+        self.media, self.is_sampled = media, is_sampled
 
-    def draw(self, sampler: mi.Sampler, active: mi.Bool) -> Any:
-        """Draw nothing: the estimate is deterministic."""
+    def draw(self, sampler: mi.Sampler | SpreadSampler, active: mi.Bool) -> mi.Float | None:
+        """Draw the number that places the points in cells; None for the quadrature."""
+        return sampler.next_1d() if self.is_sampled else None
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """Prepare nothing."""
@@ -342,7 +405,8 @@ class Emission:
         media = self.media
         end = find_end(media, segment.ray, segment.medium, active)
         passed = RaySegment(segment.ray, segment.medium, end.t)
-        composite = integrate_emission(media, passed, active, tangent=purpose == FORWARD)
+        u = segment.samples if self.is_sampled and purpose == IMAGE else None
+        composite = integrate_emission(media, passed, active, tangent=purpose == FORWARD, u=u)
         shared = _EmittingSegment(media, segment, passed, composite, active)
         light = SegmentLight(shared, dr.select(active, shared.weight * shared.rows(0), 0), is_replayed=True)
         T = transmittance([mi.Float(t) for t in composite.tau[: media.channels]])

@@ -236,6 +236,8 @@ class Estimators:
         long_paths_count: long paths carry as much light as short ones (an even environment) or more (emitting media); roulette
             then spares them.
         near: estimator of the light of near emitters along segments of paths in media; None if vertices draw this light.
+        camera_emission: weight of the light that media emit towards the camera without scattering [1]: 0 if this light has
+            camera rays of its own.
         shows: emitters that the camera sees directly: "all", the "lamps" (emitters with a surface), or the "rest".
         media: media of the scene.
         draws_shadows: shadow rays of vertices are estimated, by tracking or by roulette, with a random number.
@@ -251,6 +253,7 @@ class Estimators:
     long_paths_count: bool = False
     near: NearLighting | None = None
     shows: str = "all"
+    camera_emission: mi.Float | float = 1.0
     media: SceneMedia = field(init=False)
     draws_shadows: bool = field(init=False)
 
@@ -279,9 +282,10 @@ class Estimators:
         settings = replace(self.settings, max_depth=1)
         return Estimators(self.direct, Absorption(self.media), settings, lights_surfaces=False, shows="lamps")
 
-    def without_lamps(self) -> Estimators:
-        """The estimators of all other light."""
-        return replace(self, shows="rest")
+    def of_camera_emission(self) -> Estimators:
+        """The estimators of the light that media emit towards the camera, attenuated and without scattering."""
+        settings = replace(self.settings, max_depth=1, hide_emitters=True)
+        return Estimators(self.direct, Emission(self.media, is_sampled=True), settings, lights_surfaces=False)
 
     def replayed(self) -> Estimators:
         """The estimators of the radiance that a replay subtracts from, without light sampled anew for its derivatives."""

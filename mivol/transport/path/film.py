@@ -12,7 +12,7 @@ draw their own numbers, stratified over all passes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -76,11 +76,11 @@ class LightOfOwnRays:
     """Light that has more camera rays than the rest of an image.
 
     Attributes:
-        per_sample: rays for each sample of the image.
+        per_pixel: rays of a pixel.
         sample: radiance along camera rays.
     """
 
-    per_sample: int
+    per_pixel: int
     sample: Callable[[CameraRays], mi.Spectrum]
 
 
@@ -197,7 +197,7 @@ def _sample_rays(samples: RenderSamples, time: mi.Float, on_film: mi.Point2f, ap
 
 
 def render_on_film(
-    samples: RenderSamples, names: list[str], sample: RadianceFunction, own: LightOfOwnRays | None = None
+    samples: RenderSamples, names: list[str], sample: RadianceFunction, own: Sequence[LightOfOwnRays] = ()
 ) -> mi.TensorXf:
     """Render an image: sample the rays pass by pass, and average them on the sensor's film.
 
@@ -205,19 +205,19 @@ def render_on_film(
         samples: samples of the render.
         names: names of the AOVs, in the order returned by ``sample``.
         sample: :data:`RadianceFunction`.
-        own: light to be added, with rays of its own; None for none. Not for films that store other channels than colours.
+        own: light to be added, with rays of its own. Not for films that store other channels than colours.
 
     Returns:
         Image (height, width, colours + AOVs).
     """
     film = samples.sensor.film()
-    light = None if own is None else _average_light(samples, own)
+    light = sum((_average_light(samples, other, OWN_SEED + number) for number, other in enumerate(own)), mi.Float(0))
     film.prepare(names)
     for rays in film_passes(samples):
         L, alpha, aovs = sample(rays)
         block = _new_block(film, rays)
         _add_samples(block, film, rays, _FilmSample(L * rays.weight, mi.Float(1), alpha, aovs))
-        if light is not None:
+        if own:
             block = _add_light(block, film, light)
         film.put_block(block)
         dr.eval(block.tensor())
@@ -225,12 +225,11 @@ def render_on_film(
     return film.develop()
 
 
-def _average_light(samples: RenderSamples, own: LightOfOwnRays) -> mi.Float:
+def _average_light(samples: RenderSamples, own: LightOfOwnRays, seed: int) -> mi.Float:
     """The light of rays of their own in each pixel of a block (3 channels): the mean over their filter weights."""
-    spp = (samples.spp or samples.sensor.sampler().sample_count()) * own.per_sample
     film, total = samples.sensor.film(), None
     channels = film.prepare([])
-    for rays in film_passes(replace(samples, spp=spp, seed=samples.seed ^ OWN_SEED)):
+    for rays in film_passes(replace(samples, spp=own.per_pixel, seed=samples.seed ^ seed)):
         block = _new_block(film, rays)
         light = own.sample(rays) * rays.weight
         _add_samples(block, film, rays, _FilmSample(light, mi.Float(1), mi.Float(1), []))

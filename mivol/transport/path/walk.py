@@ -386,6 +386,9 @@ def _follow_segment(estimators: Estimators, path: Path) -> tuple[Path, PathEvent
         segment.known, path.known = path.known, path.known.forget()
     if estimators.emission is not None:
         segment.emission_weight = estimators.emission.weigh_path(path.last, path.emission_pdf, path.ray.d, path.active)
+    if not (isinstance(estimators.camera_emission, float) and estimators.camera_emission == 1):
+        weight = dr.select(path.depth == 0, estimators.camera_emission, 1)
+        segment.emission_weight = weight * (1 if segment.emission_weight is None else segment.emission_weight)
     estimate = estimators.segment.estimate(segment, path.score.purpose, path.active)
     if estimate.light is not None:
         path.score = path.score.add(estimate.light)
