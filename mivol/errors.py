@@ -18,6 +18,10 @@ class MivolError(ValueError):
         return super().__str__().encode("utf-8", "backslashreplace").decode("utf-8")
 
 
+class MivolWarning(RuntimeWarning):
+    """A doubt about a usable input, in one sentence for the user; the command ``mivol`` prints it without a line of code."""
+
+
 class WorkersLost(MivolError):
     """The workers of a cluster cannot go on. A fit has not taken the step under way, and keeps its state in a checkpoint."""
 

@@ -11,6 +11,7 @@ import errno
 import os
 import shlex
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,7 +33,7 @@ from mivol.cli.flags import (
     view_flags,
 )
 from mivol.cli.inputs import draft_scan_of, explain, load_experiment, load_named_scene, parse_defines
-from mivol.errors import MivolError
+from mivol.errors import MivolError, MivolWarning
 from mivol.optim.interrupt import Signals
 
 STOPPED, UNREAD = 130, 141
@@ -49,6 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         reads the output any more; ``validate`` has more.
     """
     signals = Signals()
+    if argv is None:  # the process is the program
+        warnings.formatwarning = format_warning
     try:
         try:
             arguments = parse(list(sys.argv[1:] if argv is None else argv))
@@ -85,6 +88,16 @@ def describe_error(error: MivolError | OSError | MemoryError) -> str:
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return f"no space is left on the disk ({error}): free some space, or write elsewhere; finished files are kept."
     return str(error)
+
+
+def format_warning(message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None) -> str:
+    """Text of a warning: the sentence of a :class:`MivolWarning`, and Python's text of any other."""
+    if issubclass(category, MivolWarning):
+        return f"mivol: {message}\n"
+    return FORMAT_OF_PYTHON(message, category, filename, lineno, line)
+
+
+FORMAT_OF_PYTHON = warnings.formatwarning
 
 
 def parse(words: Sequence[str]) -> argparse.Namespace:

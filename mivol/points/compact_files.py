@@ -39,6 +39,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from mivol.errors import MivolWarning
 from mivol.files.npy import check_memory
 from mivol.files.source import CODECS, decompress, parse_elements, read_bytes, refusal
 from mivol.points.gaussians import (
@@ -368,7 +369,7 @@ def _leave_out(gaussians: Gaussians, degree: int, suffix: str) -> Gaussians:
     if gaussians.degree <= degree:
         return gaussians
     text = f"a {suffix} holds harmonics up to degree {degree}: those of degree {degree + 1} to {gaussians.degree} are left out."
-    warnings.warn(text, RuntimeWarning, stacklevel=4)
+    warnings.warn(text, MivolWarning, stacklevel=4)
     return gaussians.with_degree(degree)
 
 

@@ -27,6 +27,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from mivol.errors import MivolWarning
 from mivol.files import ply
 from mivol.files.source import refusal
 from mivol.points.gaussians import HIGHEST_DEGREE, Gaussians, complete_quaternions, logit, to_base_harmonics
@@ -99,7 +100,7 @@ def _parse_higher_harmonics(table: np.ndarray, path: str | os.PathLike) -> np.nd
         return np.empty((len(table), 0, 3), np.float32)
     kept = (HIGHEST_DEGREE + 1) ** 2 - 1
     if count > 3 * kept:
-        warnings.warn(f"{path}: harmonics of degree 4 are cut to degree {HIGHEST_DEGREE}.", RuntimeWarning, stacklevel=2)
+        warnings.warn(f"{path}: harmonics of degree 4 are cut to degree {HIGHEST_DEGREE}.", MivolWarning, stacklevel=2)
     return np.swapaxes(_stack_columns(table, names).reshape(len(table), 3, count // 3), 1, 2)[:, :kept]
 
 

@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.back_end import check_variant
+from mivol.errors import MivolWarning
 from mivol.kernel_recording import is_recording
 from mivol.scene.media_light import MediaLight, read_media_light
 from mivol.scene.nesting import OrientedBox, shape_bounds
@@ -150,7 +151,7 @@ def warn_of_misplaced_grids(needs: Needs, survey: SceneSurvey) -> None:
     for facts in needs.media:
         if facts.misplaced and (facts.name, "misplaced") not in survey.warned:
             survey.warned.add((facts.name, "misplaced"))
-            warnings.warn(f"{facts.misplacement} (this is said once).", RuntimeWarning, stacklevel=2)
+            warnings.warn(f"{facts.misplacement} (this is said once).", MivolWarning, stacklevel=2)
 
 
 def find_clipped_view(needs: Needs, sensor: mi.Sensor) -> str:
@@ -174,7 +175,7 @@ def warn_of_clipped_view(needs: Needs, sensor: mi.Sensor, survey: SceneSurvey) -
         return
     survey.warned.add(("clipped", sensor.ptr))
     if said := find_clipped_view(needs, sensor):
-        warnings.warn(f"{said} (this is said once).", RuntimeWarning, stacklevel=2)
+        warnings.warn(f"{said} (this is said once).", MivolWarning, stacklevel=2)
 
 
 def _is_placement(key: str, owner: object) -> bool:

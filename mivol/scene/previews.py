@@ -47,6 +47,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mivol.errors import MivolWarning
 from mivol.kernel_recording import is_recording, without_garbage_collection
 from mivol.scene.choices import (
     is_branch_noise_open,
@@ -238,7 +239,7 @@ def warn_of_last_order(
             f"max_depth was not given: light that scatters {settings.max_depth - 1} times, the last order of the default of "
             f"{settings.max_depth}, still carries {share:.0%} of the image; give max_depth (-1 for all light, as in volpath; "
             "this is said once).",
-            RuntimeWarning,
+            MivolWarning,
             stacklevel=2,
         )
 

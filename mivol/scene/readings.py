@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.errors import MivolError
+from mivol.errors import MivolError, MivolWarning
 from mivol.fields.activation import Activation
 from mivol.files import check_volume
 from mivol.kernel_recording import is_recording
@@ -145,7 +145,7 @@ def _clip_negative(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.
             f"{int((values < 0).sum())} of {values.size} values of {part.name} of the medium in {name} are below 0, the least "
             f"{values.min():.3g}: they count as 0, with the derivative at 0; add params[key] = dr.maximum(params[key], 0) "
             "after each step or filter, or give mivol.Parameter(key, domain=(0, ...)) (this is said once).",
-            RuntimeWarning,
+            MivolWarning,
             stacklevel=2,
         )
     floored = dr.maximum(dr.detach(part.lattice.values.array), 0)

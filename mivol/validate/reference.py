@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.back_end import check_variant
-from mivol.errors import MivolError
+from mivol.errors import MivolError, MivolWarning
 from mivol.files.atomic import lock_folder
 from mivol.optim.interrupt import InterruptGuard
 from mivol.photos.transforms import write_transforms
@@ -474,7 +474,7 @@ def _check_trust(scene: mi.Scene, sensor: mi.Sensor, accept: bool) -> tuple[Doub
     if fatal and not accept:
         raise MivolError(f"Mitsuba {mi.__version__} cannot be the reference for this scene: {fatal[0].sentence}")
     for doubt in doubts:
-        warnings.warn(doubt.sentence, RuntimeWarning, stacklevel=4)
+        warnings.warn(doubt.sentence, MivolWarning, stacklevel=4)
     return tuple(doubts)
 
 

@@ -25,7 +25,7 @@ from scipy.ndimage import uniform_filter
 
 import mivol
 from mivol.display import with_short_repr
-from mivol.errors import MivolError
+from mivol.errors import MivolError, MivolWarning
 from mivol.files.atomic import write_whole
 from mivol.files.image_files import read_exr, write_exr
 from mivol.files.npy import read_archive
@@ -335,7 +335,7 @@ def drop_damaged(path: Path) -> None:
             if file.exists():
                 read(file)
         except MivolError as error:
-            warnings.warn(f"{file.name} is damaged and made anew: {error}", RuntimeWarning, stacklevel=4)
+            warnings.warn(f"{file.name} is damaged and made anew: {error}", MivolWarning, stacklevel=4)
             file.unlink()
 
 

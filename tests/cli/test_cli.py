@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from pathlib import Path
 
 import drjit as dr
@@ -13,7 +14,7 @@ import pytest
 from tiny_experiment import PHOTOS, SCENE, refused, run, write_experiment
 
 from mivol.cli import VERBS, describe_error, load_named_scene, main, parse
-from mivol.errors import MivolError
+from mivol.errors import MivolError, MivolWarning
 from mivol.files import read_exr
 
 
@@ -224,3 +225,12 @@ def test_verbs_are_short() -> None:
     import inspect
 
     assert all(len(inspect.getsource(verb.run).splitlines()) < 30 for verb in VERBS.values())
+
+
+def test_a_doubt_of_mivol_is_one_sentence_without_a_line_of_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A warning of another package keeps its place, which a report of a fault needs."""
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
+    monkeypatch.setattr(sys, "argv", ["mivol", "demo"])
+    assert main() == 0
+    assert warnings.formatwarning(MivolWarning("a is cut."), MivolWarning, "ply.py", 3, "code") == "mivol: a is cut.\n"
+    assert warnings.formatwarning(RuntimeWarning("1 / 0"), RuntimeWarning, "ply.py", 3, "code").startswith("ply.py:3: Runtime")
