@@ -352,6 +352,7 @@ def export(arguments: argparse.Namespace) -> None:
     from mivol.fields.field_archives import read_field_view
     from mivol.fields.field_files import read_field, write_field
     from mivol.fields.sampled_field import SampledField
+    from mivol.files.formats import check_has_reader
     from mivol.points.summary import SUFFIXES
 
     set_variant(arguments.mode)
@@ -360,6 +361,7 @@ def export(arguments: argparse.Namespace) -> None:
             raise MivolError(f"{arguments.field}: --level is for the mesh of a field: leave it out.")
         print("\n".join(str(path) for path in convert_to_scene(arguments.field, arguments.output)))
         return
+    check_has_reader(arguments.field)
     field, sky, view = read_field(arguments.field), sky_beside(arguments.field), read_field_view(arguments.field)
     is_copy = arguments.output.suffix == ".npz" and not arguments.output.name.endswith((".svox2.npz", ".svox.npz"))
     if isinstance(field, SampledField) and not is_copy:

@@ -120,10 +120,9 @@ def is_fit(arguments: argparse.Namespace) -> bool:
 def check_contents(path: Path) -> None:
     """Refuse a volume, and binary data that no reader takes, in place of a scene, an experiment or a cloud."""
     from mivol.experiments.found_scan import describe_missing
-    from mivol.files.formats import is_unread, refuse_unread
+    from mivol.files.formats import check_has_reader
 
-    if is_unread(path):
-        raise refuse_unread(path)
+    check_has_reader(path)
     if holds_volume(path):
         found = describe_missing(path) or "a volume"
         raise MivolError(f"{path}: found {found}, expected a scene, a fit or points; render, explain and convert take it.")

@@ -119,7 +119,7 @@ FORMATS: dict[str, VolumeFormat] = {
 RAW_BYTES = "raw bytes"
 
 #: name of a kind of file without a reader here -> (test of the first ``HEAD`` bytes, way out).
-ARCHIVE, FILM = "a zip archive", "a video"
+ARCHIVE, FILM = "a packed archive", "a video"
 """Files that phones export, which other verbs take or which have to be unpacked."""
 
 UNREAD: dict[str, tuple[Callable[[bytes], bool], str]] = {
@@ -133,7 +133,10 @@ UNREAD: dict[str, tuple[Callable[[bytes], bool], str]] = {
         _starts_with(b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"),
         "export projections, references and angles as TIFF and text, and name their folder",
     ),
-    ARCHIVE: (_starts_with(b"PK\x03\x04"), "unpack it, and name its folder"),
+    ARCHIVE: (
+        lambda head: head.startswith((b"PK\x03\x04", b"7z\xbc\xaf", b"Rar!")) or head[257:262] == b"ustar",
+        "unpack it, and name its folder",
+    ),
     FILM: (
         lambda head: (head[4:8] == b"ftyp" and head[8:11] != b"hei") or head.startswith((b"\x1aE\xdf\xa3", b"RIFF")),
         "mivol poses FILE finds the cameras of its frames",
@@ -505,11 +508,15 @@ def _keep_place(suffix: str, volume: VolumeData | SparseVolumeData) -> tuple[np.
     return frame_from_steps(volume.size, np.diag(volume.spacing), origin if suffix == ".mrc" else np.zeros(3)), lost
 
 
-def is_unread(path: Path) -> bool:
-    """Whether a file holds binary data, and its suffix is neither in :data:`FORMATS` nor a suffix of scenes or experiments."""
-    if path.name.lower().endswith((*FORMATS, ".xml", ".toml")) or not path.is_file():
-        return False
-    return _find_unread(path) is not None
+def check_has_reader(path: Path) -> None:
+    """Refuse binary data whose suffix is neither in :data:`FORMATS` nor a suffix of scenes or experiments.
+
+    Raises:
+        MivolError: as :func:`refuse_unread`.
+    """
+    is_known = path.name.lower().endswith((*FORMATS, ".xml", ".toml")) or not path.is_file()
+    if not is_known and _find_unread(path) is not None:
+        raise refuse_unread(path)
 
 
 def refuse_unread(path: Path) -> MivolError:
@@ -578,6 +585,8 @@ def _read_head(path: Path) -> bytes:
 def _find_unread(path: Path) -> str | None:
     if path.suffix.lower() in raw.SUFFIXES:
         return RAW_BYTES
+    if path.name.lower().endswith((".tar.gz", ".tgz")):
+        return ARCHIVE
     head = _read_head(path)
     return next((name for name, (recognise, _) in UNREAD.items() if recognise(head)), None)
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.experiments.run_folder import NEWEST, PHOTOGRAPHS
-from mivol.files.formats import is_volume
+from mivol.files.formats import check_has_reader, is_volume
 from mivol.files.source import refusal
 from mivol.photos import Camera, PhotoSurvey, find_format
 from mivol.points.summary import is_points_file
@@ -92,6 +92,7 @@ def _open(path: Path, dataset: str | None, defines: Mapping[str, str] | None, sa
         return GaussianSubject(path)
     if is_volume(path):
         return VolumeSubject(path, dataset)
+    check_has_reader(path)
     found = "a folder without a run or posed photographs" if path.is_dir() else f"a file {path.suffix or 'without a suffix'}"
     way_out = f"mivol poses {path} finds poses of photographs" if path.is_dir() else "mivol explain says what it is"
     raise refusal(path, found, "a run, posed photographs, a model (.npz, .ply, ...), a volume or a scene (.xml)", way_out)

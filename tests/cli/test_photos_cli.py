@@ -125,6 +125,9 @@ def test_explain_refuses_a_folder_without_cameras(tmp_path: Path, capsys: pytest
     ("name", "head", "way_out"),
     [
         ("scan.r3d", b"PK\x03\x04", "unpack it, and name its folder"),
+        ("a.7z", b"7z\xbc\xaf\x27\x1c", "unpack it, and name its folder"),
+        ("a.tar", b"a.jpg" + bytes(252) + b"ustar", "unpack it, and name its folder"),
+        ("a.tar.gz", b"\x1f\x8b", "unpack it, and name its folder"),
         ("a.mp4", b"\0\0\0\x20ftypisom", "mivol poses FILE finds"),
         ("a.webm", b"\x1aE\xdf\xa3", "mivol poses FILE finds"),
     ],
@@ -133,8 +136,8 @@ def test_exports_of_phones_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, head: bytes, way_out: str
 ) -> None:
     (tmp_path / name).write_bytes(head + bytes(64))
-    for verb in ("optimize", "explain"):
-        assert main([verb, str(tmp_path / name)]) == 1
+    for verb, *more in (["optimize"], ["explain"], ["export", str(tmp_path / "a.xml")]):
+        assert main([verb, str(tmp_path / name), *more]) == 1
         assert way_out in capsys.readouterr().err
 
 

@@ -123,6 +123,8 @@ def test_a_run_shows_its_photographs_before_it_has_a_model(tmp_path: Path) -> No
 def test_foreign_paths_are_refused_in_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "a.pdf").write_text("text")
-    for name, word in (("missing", "no file"), ("empty", "mivol poses"), ("a.pdf", "mivol explain")):
+    (tmp_path / "scan.zip").write_bytes(b"PK\x03\x04" + bytes(64))
+    known = (("missing", "no file"), ("empty", "mivol poses"), ("a.pdf", "mivol explain"), ("scan.zip", "unpack it"))
+    for name, word in known:
         with pytest.raises(MivolError, match=word):
             open_subject(tmp_path / name)
