@@ -82,7 +82,8 @@ def _check_conversion(arguments: argparse.Namespace) -> str | None:
     """Return the kind of the output; refuse flags and suffixes that do not belong together."""
     source, target = arguments.source, arguments.output
     from_field, is_field = (path.suffix.lower() == ".npz" for path in (source, target))
-    kind = arguments.to or WRITTEN_AS.get(target.suffix.lower())
+    is_svox = target.name.lower().endswith(".svox.npz")
+    kind = arguments.to or ("octree" if is_svox else WRITTEN_AS.get(target.suffix.lower()))
     if kind in ("hash", "nerf"):
         if not is_field or arguments.resolution or arguments.box:
             raise MivolError(f"{target}: --to {kind} writes an .npz, fitted to views of the source: leave out other flags.")
@@ -92,7 +93,7 @@ def _check_conversion(arguments: argparse.Namespace) -> str | None:
             f"{target}: no conversion makes a nested grid, whose outer boxes hold what lies around the cameras, since other "
             "models hold nothing outside of their one box: make a grid (--to grid), which is a nested grid of one box."
         )
-    if from_field and is_field and arguments.to not in ("grid", "octree"):
+    if from_field and is_field and kind not in ("grid", "octree"):
         raise MivolError(
             f"{target}: --to says what a field becomes: octree, hash or nerf, and grid for all but a grid of one box."
         )

@@ -142,7 +142,10 @@ class OctreeFit(FieldFit):
         if plan.grid is not None:
             return OctreeProblem(self.batches, box, plan, self.settings.seed)
         if self.start is None:
-            self.start = read_start(self.context.base / self.settings.field.start, self.photos.space, self.photos.white)
+            path = self.context.base / self.settings.field.start
+            if not path.exists():
+                raise MivolError(f'field.start: found no file {path}, expected a field (.npz), "hash" or "nerf": give one.')
+            self.start = read_start(path, self.photos.space, self.photos.white)
         begun = time.perf_counter()
         if isinstance(self.start, Octree):
             tree = self.start

@@ -104,7 +104,7 @@ def read_field(path: str | os.PathLike) -> SphericalGrid | SampledField | Octree
     """
     path = Path(path)
     if not path.is_file():
-        raise MivolError(f"found no file {path}; give a radiance field (.npz).")
+        raise MivolError(f"found no file {path}, expected a radiance field (.npz): check the path.")
     if path.suffix.lower() != ".npz" and not is_zipfile(path):
         raise refusal(path, f"a file {path.suffix or 'without a suffix'}", "a radiance field (.npz)", "give the field of a fit")
     arrays = read_archive(path)
@@ -114,6 +114,8 @@ def read_field(path: str | os.PathLike) -> SphericalGrid | SampledField | Octree
             return kind.parse(path.name, arrays)
     if is_sampled_archive(arrays):
         return parse_sampled_archive(path.name, arrays)
+    if any(name.startswith("reals/") for name in arrays):
+        raise refusal(path, "the checkpoint of a fit", "a radiance field", "give field.npz of the same run folder")
     known = " or a ".join(kind.name for kind in readable)
     raise MivolError(f"{path.name} holds {', '.join(arrays) or 'nothing'}; a {known} is expected.")
 

@@ -108,13 +108,25 @@ def _load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     return arrays, about
 
 
+def _find_kind(settings: dict[str, Any]) -> str:
+    """The model of a fit, by its settings: ``field.kind``, or the first table of another experiment."""
+    tables = {key.split(".")[0] for key in settings}
+    return settings.get("field.kind") or next((word for word in ("gaussians", "scan", "scene") if word in tables), "unknown")
+
+
 def check_same(path: Path, saved: dict[str, Any], current: dict[str, Any]) -> None:
-    """Check that a checkpoint belongs to this run; the message names the first different setting.
+    """Check that a checkpoint belongs to this run; the message names the kinds, or the first different setting.
 
     Raises:
         MivolError: another run, with both values.
     """
     current = json.loads(json.dumps(current))
+    kinds = [_find_kind(settings) for settings in (saved, current)]
+    if kinds[0] != kinds[1]:
+        raise MivolError(
+            f"{path} is the checkpoint of a fit of the kind {kinds[0]}, and the kind {kinds[1]} is expected here: "
+            "restore the kind, or run without --resume."
+        )
     for key in sorted({*saved, *current}):
         # None: the number of iterations is left to the kind of fit.
         if key in GROWABLE_SETTINGS and (saved.get(key) or 0) <= (current.get(key) or 0):

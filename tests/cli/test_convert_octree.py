@@ -43,6 +43,9 @@ def test_a_field_becomes_an_octree_and_a_grid_again(field: Path, capsys: pytest.
     assert main(["render", str(tree), "-o", str(image)]) == 0 and image.is_file()
     assert main(["convert", str(tree), str(grid), "--to", "grid"]) == 0
     assert isinstance(read_field(grid), SphericalGrid)
+    svox = field.with_name("tree.svox.npz")
+    assert main(["convert", str(tree), str(svox)]) == 0  # the suffix says what it becomes
+    assert read_field(svox).colours == "sigmoid" and read_field(svox).leaves == octree.leaves
 
 
 @pytest.mark.slow

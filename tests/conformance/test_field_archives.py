@@ -204,10 +204,12 @@ def test_a_checkpoint_of_svox2(variant_rgb: str, tmp_path: Path) -> None:
 
 def test_files_that_are_refused(variant_rgb: str, tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    np.savez(tmp_path / "checkpoint.npz", **{"about": np.array("{}"), "reals/table": np.zeros(3)})
     (tmp_path / "torn.npz").write_bytes(b"PK\x03\x04 and no more")
     (tmp_path / "smoke.vol").write_bytes(b"VOL\x03")
     said_of = {
         "none.npz": "found no file",
+        "checkpoint.npz": "found the checkpoint of a fit, expected a radiance field; give field.npz",
         "other.npz": "holds a;",
         "torn.npz": "a damaged archive",
         "smoke.vol": "a file .vol, exp",

@@ -70,6 +70,8 @@ def test_the_first_level_is_a_network_of_its_preset(
     with pytest.raises(MivolError, match='"cpu" is no preset of the (hash|nerf) network: choose one of tiny'):
         make_octree_plan(config.load(toml(photographs, f'start = "{start}"\npreset = "cpu"')))
     assert find_preset(config.load(toml(photographs, f'start = "{start}"')).field) == NETWORKS[start]
+    assert main(["explain", str(toml(photographs, 'start = "hsah"'))]) == 1
+    assert 'hsah, expected a field (.npz), "hash" or "nerf"' in capsys.readouterr().out
 
 
 @pytest.mark.slow

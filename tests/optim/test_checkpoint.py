@@ -140,6 +140,10 @@ def test_refused_checkpoints(tmp_path: Path) -> None:
     ):
         with pytest.raises(MivolError, match=sentence):
             checkpoint.read(path, here | change)
+    hashed = {"field.kind": "hash", "field.effort": 0.5}
+    for settings, kind in ((hashed | {"field.kind": "octree"}, "octree"), ({"gaussians.preset": "tiny"}, "gaussians")):
+        with pytest.raises(MivolError, match=f"of the kind hash, and the kind {kind} is expected here"):
+            checkpoint.read(written(tmp_path / "hash.npz", hashed), settings)
     with pytest.raises(MivolError, match="without --resume first"):
         checkpoint.read(tmp_path / "none.npz", here)
     data = path.read_bytes()
