@@ -198,7 +198,7 @@ def export_flags() -> list:
 
 def convert_flags() -> list:
     """Flags of ``mivol convert``."""
-    from mivol.files.formats import VOLUME_SUFFIXES, WRITERS
+    from mivol.files.formats import FOLDER_WRITERS, VOLUME_SUFFIXES, WRITERS
     from mivol.points.cloud import CLOUD_READERS, CLOUD_WRITERS
     from mivol.points.gaussian_files import GAUSSIAN_READERS, GAUSSIAN_WRITERS
     from mivol.points.summary import KINDS
@@ -208,7 +208,8 @@ def convert_flags() -> list:
         flag("source", type=Path,
              help=f"file to read: {', '.join(readable)}, .npz (field); volumes: {', '.join(VOLUME_SUFFIXES)}"),
         flag("output", type=Path,
-             help=f"file to write: {', '.join(writable)}, .npz (field), .obj (mesh); volumes: {', '.join(WRITERS)}"),
+             help=f"file to write: {', '.join(writable)}, .npz (field), .obj (mesh); "
+                  f"volumes: {', '.join(WRITERS | FOLDER_WRITERS)}"),
         DATASET,
         SHAPE,
         DTYPE,

@@ -41,6 +41,9 @@ DARK_WORDS = {"dark", "darks", "darkfield", "df", "dc", "di", "offset", "bias", 
 
 ANGLE_FILES = (".txt", ".csv", ".ang", ".tlt", ".rawtlt")
 
+SCANNER_FILES = (".log", ".pca", ".info", ".par")
+"""Suffixes of files of scanners (Bruker, GE, ESRF) that tell a scan from slices of a volume; mivol does not read them."""
+
 DARKER = 0.9
 """Share of the light of the edges below which the middle of a view counts as darker."""
 
@@ -149,7 +152,8 @@ def _draft_hdf5(path: Path, given: dict[str, Any]) -> ScanDraft:
         first, last = np.degrees(scan.angles[[0, -1]])
         lines.append(f"found: angles from {first:.4g} to {last:.4g} degrees")
     lines += _draft_beam(raw_scan, scan.pitch, scan.distances, (height, columns))
-    raw = {"scan": raw_scan, "data": {"source": "measured", "file": str(path)}}
+    raw: dict[str, Any] = {"unit": "mm"} if scan.pitch else {}
+    raw |= {"scan": raw_scan, "data": {"source": "measured", "file": str(path)}}
     return _finish(raw, [*lines, *_put_grid(raw, rows, columns)], views)
 
 
@@ -258,7 +262,7 @@ def _draft_nikon(path: Path, given: dict[str, Any]) -> ScanDraft:
         f"found: {scan.source_to_axis:.6g} mm from source to axis, {scan.source_to_detector:.6g} mm to the detector",
         f"found: white level {scan.white_level:g}, angles from {scan.angles[0]:.4g} to {scan.angles[-1]:.4g} degrees",
     ]
-    raw: dict[str, Any] = {"scan": {"beam": "data"}, "data": {"source": "nikon", "file": str(path)}}
+    raw: dict[str, Any] = {"unit": "mm", "scan": {"beam": "data"}, "data": {"source": "nikon", "file": str(path)}}
     if scan.shape is None:
         beam = {"beam": "cone", "pitch": scan.pitch} | {
             "source_to_axis": scan.source_to_axis, "source_to_detector": scan.source_to_detector
@@ -290,7 +294,7 @@ def _draft_dicom(path: Path, given: dict[str, Any]) -> ScanDraft:
         beam["detector_offset"] = scan.detector_offset
         lines.append("found: the detector's middle {:.6g} and {:.6g} mm beside the central ray".format(*scan.detector_offset))
     data = {"source": "stack", "file": str(path), "angles": str(path)} | reading
-    raw = {"scan": beam, "data": data}
+    raw = {"unit": "mm", "scan": beam, "data": data}
     return _finish(raw, [*lines, *_put_grid(raw, rows, columns)], views)
 
 
@@ -362,7 +366,8 @@ def _draft_tilt_series(path: Path, given: dict[str, Any]) -> ScanDraft:
         scan["pitch"] = [float(f"{edge:.8g}") for edge in volume.spacing[1::-1]]
         lines.append(f"found: pixels of {scan['pitch'][0]:.6g} x {scan['pitch'][1]:.6g} angstrom (rows, columns)")
     lines.append("chosen: the axis is in the middle; data.find_axis = true looks for it, if the views cover half a turn")
-    raw = {"scan": scan, "data": data}
+    raw: dict[str, Any] = {"unit": "A"} if "pitch" in scan else {}
+    raw |= {"scan": scan, "data": data}
     return _finish(raw, [*lines, *_put_grid(raw, rows, columns)], views)
 
 
@@ -370,12 +375,14 @@ def _draft_tilt_series(path: Path, given: dict[str, Any]) -> ScanDraft:
 
 
 def has_scan_files(folder: Path) -> bool:
-    """Whether flats, darks or a file of angles lie beside the images of a folder: they tell a scan from slices of a volume."""
+    """Whether flats, darks, angles or a scanner's file lie beside the images of a folder: they tell a scan from slices."""
     if not folder.is_dir():
         return False
     if any(group.words & (FLAT_WORDS | DARK_WORDS) for group in group_images(folder, IMAGES)):
         return True
     for file in folder.iterdir():
+        if file.suffix.lower() in SCANNER_FILES:
+            return True
         if file.suffix.lower() in ANGLE_FILES:
             with suppress(MivolError):
                 read_columns(file, 1)
@@ -417,6 +424,11 @@ def _draft_tiff(path: Path, given: dict[str, Any]) -> ScanDraft:
     )
     lines += _draft_angles(folder, scan, data, counts["views"], three)
     lines += _draft_beam(scan, None, (None, None), (rows, columns))
+    if unread := sorted(file.name for file in folder.iterdir() if file.suffix.lower() in SCANNER_FILES):
+        lines.append(
+            f'found: {", ".join(unread)}: not read; if distances are in it, set scan.beam = "cone", scan.source_to_axis, '
+            "scan.source_to_detector, scan.pitch and scan.arc"
+        )
     raw = {"scan": scan, "data": data}
     return _finish(raw, [*lines, *_put_grid(raw, rows, columns)], counts["views"])
 

@@ -180,13 +180,13 @@ class ScanFit(FitKind):
 
     def write_outputs(self, fit: Fit, run: RunFolder, best: BestIterate) -> None:
         volume = fit.run.state.x.reshape(self.projector.grid.shape)
-        write_outputs(run, self.projector, self.grid, self.data, self.held_out, volume)
+        write_outputs(run, self.projector, self.grid, self.data, self.held_out, volume, self.settings.unit)
         if self.alignment is not None:
             moves, found = self.alignment.moves, self.alignment
             save_figure(plot_moves(moves, found.before, found.after), run.path / "moves.png")
             caption = "fitted moves of the detector, and the residual of held-out views without and with them"
             self.record.images.append(Image(path="moves.png", role="picture", caption=caption))
-        write_best(run, self.grid, best)
+        write_best(run, self.grid, best, self.settings.unit)
         if not self.settings.keep_state:
             fit.run.is_left_to_outputs = True
             fit.save()
@@ -333,7 +333,13 @@ def data_norm(task: LeastSquares | PoissonCounts) -> float:
 
 
 def write_outputs(
-    run: RunFolder, projector: Projector, grid: VoxelGrid, data: Projections, held_out: np.ndarray, x: np.ndarray
+    run: RunFolder,
+    projector: Projector,
+    grid: VoxelGrid,
+    data: Projections,
+    held_out: np.ndarray,
+    x: np.ndarray,
+    unit: str = "",
 ) -> None:
     """Write volume, sinogram, held-out views and curves, and record the files and the results.
 
@@ -344,11 +350,12 @@ def write_outputs(
         data: projections.
         held_out: indices of the held-out views.
         x: reconstruction (Z, Y, X) on the projector's grid.
+        unit: unit of lengths; "": unknown.
     """
     run.make("views", "volumes")
     predicted, record = projector @ x, run.record
     volume = voxel_means(x, grid.shape)
-    record.volumes += write_grids(run.path, grid, volume, data.truth)
+    record.volumes += write_grids(run.path, grid, volume, data.truth, unit)
     record.images += film_of_volume(run, volume[..., None], tuple(float(edge) for edge in grid.extent), "z", "sigma_t")
     middle = data.y.shape[1] // 2
     noise = line_noise(data)
@@ -408,10 +415,16 @@ def read_finished(folder: Path, unknowns: VoxelGrid) -> np.ndarray:
     return volume.reshape(-1)
 
 
-def write_best(run: RunFolder, grid: VoxelGrid, best: BestIterate) -> None:
+def write_best(run: RunFolder, grid: VoxelGrid, best: BestIterate, unit: str) -> None:
     """Write the best iterate beside the last iterate, if the iterates differ."""
     if not best.is_newest:
-        write_volume(run.path / "volumes/reconstruction_best.npz", best.read()["volume"].reshape(grid.shape), grid.to_world)
+        values = best.read()["volume"].reshape(grid.shape)
+        write_volume(run.path / "volumes/reconstruction_best.npz", values, grid.to_world, metadata=_name_unit(unit))
+
+
+def _name_unit(unit: str) -> dict[str, object]:
+    """Metadata of a volume with the unit of its lengths, if known."""
+    return {"unit": unit} if unit else {}
 
 
 class Pair(NamedTuple):
@@ -442,11 +455,11 @@ def write_pair(folder: Path, name: str, pair: Pair, caption: str = "", held_out:
     return [Image(role=role, layer=layer, **common) for role, layer in roles.items()]
 
 
-def write_grids(folder: Path, grid: VoxelGrid, x: np.ndarray, truth: np.ndarray | None) -> list[Volume]:
-    """Write the reconstruction as .vol and .npz, and the truth if known."""
+def write_grids(folder: Path, grid: VoxelGrid, x: np.ndarray, truth: np.ndarray | None, unit: str) -> list[Volume]:
+    """Write the reconstruction as .vol and .npz, and the truth if known; the .npz keeps the unit of lengths."""
     volumes, size = [], tuple(float(edge) for edge in grid.extent)
     for role, values in {"reconstruction": x, **({"truth": truth} if truth is not None else {})}.items():
         write_volume(folder / f"volumes/{role}.vol", values, grid.to_world)
-        write_volume(folder / f"volumes/{role}.npz", values, grid.to_world)
+        write_volume(folder / f"volumes/{role}.npz", values, grid.to_world, metadata=_name_unit(unit))
         volumes.append(Volume(path=f"volumes/{role}.npz", role=role, size=size, profiles=True))
     return volumes

@@ -362,7 +362,7 @@ def _open_writer(plan: SlabPlan, run: RunFolder) -> TiffSlices | ZarrSlices:
     if plan.settings.slabs.format == "tiff":
         return TiffSlices(run.path / "volumes/slices", plan.grid.shape)
     path = run.path / "volumes/reconstruction.zarr"
-    return ZarrSlices(path, plan.grid.shape, plan.grid.to_world, resume=run.is_resumed)
+    return ZarrSlices(path, plan.grid.shape, plan.grid.to_world, unit=plan.settings.unit, resume=run.is_resumed)
 
 
 def explain_slabs(settings: config.ScanExperiment, base: Path, say: Say) -> Explanation:

@@ -279,7 +279,7 @@ def write_volume(
         to_world: unit cube to world (4, 4), by default the identity, or the place of the sparse volume. A ``.vol``
             holds an axis-aligned box, a ``.mrc`` too, a ``.tif`` voxel sizes alone, a ``.npy`` no box.
         metadata: facts in the types of JSON, for ``.npz`` and ``.nrrd``; "space" names the frame ("RAS", "LPS") there and in
-            ``.nii`` and ``.mha``, "unit" the unit of ``.nii`` and ``.tif``.
+            ``.nii`` and ``.mha``, "unit" the unit of ``.nii``, ``.tif`` and ``.zarr``.
         compress: whether a ``.npz`` is compressed; writing without compression is about ten times faster.
 
     Raises:
@@ -439,7 +439,7 @@ def convert_volume(source: Path, target: Path, dataset: str | None = None, **lay
     Raises:
         MivolError: as :func:`read_volume` and :func:`write_volume`.
     """
-    suffix = _find_suffix(target, WRITERS)
+    suffix = _find_suffix(target, WRITERS | FOLDER_WRITERS)
     # Between two formats that are sparse themselves, no dense array is made.
     is_sparse = not layout and suffix in SPARSE_READERS and is_sparse_file(source)
     if is_sparse and dataset is None and len(names := _name_grids(source)) > 1:
@@ -449,8 +449,11 @@ def convert_volume(source: Path, target: Path, dataset: str | None = None, **lay
     facts = {"space": volume.meta["space"]} if volume.meta.get("space") else {}
     if facts and suffix not in (".npz", ".nrrd", ".mhd", ".mha", ".nii"):
         lost.insert(0, f"the frame {facts.pop('space')}")
-    if suffix in (".nii", ".tif", ".tiff") and volume.meta.get("unit"):
-        facts["unit"] = volume.meta["unit"]
+    unit = str(volume.meta.get("unit") or "")
+    if suffix in (".nii", ".tif", ".tiff", ".zarr", ".npz"):
+        facts |= {"unit": unit} if unit else {}
+    elif unit in tiff.METRES and (suffix, unit) != (".mrc", "A"):
+        lost.append(f"the unit {unit}")
     if suffix in SPARSE_READERS and "grid" in volume.meta:
         facts["grid"] = str(volume.meta["grid"]).partition("[")[0]
     if np.dtype(str(volume.meta.get("dtype", "float32")).replace("text", "float32")).name in WIDE_TYPES:

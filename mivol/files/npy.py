@@ -49,7 +49,7 @@ def read_npz(path: Path, dataset: str | None = None) -> VolumeData:
         to_world = _frame(arrays["to_world"], path)
     if "metadata" in arrays:
         meta["metadata"] = _metadata(arrays["metadata"], path)
-        meta["space"] = meta["metadata"].get("space")
+        meta |= {"space": meta["metadata"].get("space"), "unit": str(meta["metadata"].get("unit", ""))}
     return VolumeData(to_values(arrays[name], path), to_world, meta)
 
 

@@ -79,7 +79,7 @@ def write_zarr(path: Path, values: np.ndarray, to_world: np.ndarray, metadata: d
     part = path.with_name(f".{path.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     channels = values.shape[3]
-    target = ZarrSlices(part, values.shape[:3], to_world, channels, str(metadata.get("unit", "")))
+    target = ZarrSlices(part, values.shape[:3], to_world, channels, str(metadata.get("unit", "")), name=path.stem)
     target.write(0, values if channels > 1 else values[..., 0])
     if path.exists() and not is_zarr(path):
         shutil.rmtree(part)
@@ -99,6 +99,7 @@ class ZarrSlices:
         channels: channels of a voxel.
         unit: unit of lengths, a value of ``UNITS``; other units are left out.
         resume: whether the folder holds the first slices.
+        name: name of the image; None: that of the folder.
 
     Raises:
         MivolError: no tensorstore, or axes that are turned against the world's.
@@ -112,6 +113,7 @@ class ZarrSlices:
         channels: int = 1,
         unit: str = "",
         resume: bool = False,
+        name: str | None = None,
     ) -> None:
         store = _tensorstore(path)
         steps, origin = split_frame(shape[::-1], to_world)
@@ -130,7 +132,7 @@ class ZarrSlices:
             translation = [*(0.0 for _ in more), *(float(o) for o in origin[::-1])]
             about = {
                 "version": "0.4",
-                "name": path.stem,
+                "name": path.stem if name is None else name,
                 "axes": [{"name": "c", "type": "channel"} for _ in more] + space,
                 "datasets": [{
                     "path": "0",

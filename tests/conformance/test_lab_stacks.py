@@ -35,6 +35,10 @@ def test_ours_is_read_by_tensorstore_and_by_us(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.values[..., 0], VALUES)
     np.testing.assert_allclose(found.to_world, PLACE, atol=1e-12)
     assert found.meta["unit"] == "um"
+    assert about["name"] == "a"
+    assert main(["convert", str(tmp_path / "a.zarr"), str(tmp_path / "b.npz")]) == 0
+    assert main(["convert", str(tmp_path / "b.npz"), str(tmp_path / "b.zarr")]) == 0
+    assert read_volume(tmp_path / "b.zarr").meta["unit"] == "um"
     colours = np.stack([VALUES, 2 * VALUES], -1)
     write_volume(tmp_path / "a.zarr", colours, PLACE)
     np.testing.assert_array_equal(read_volume(tmp_path / "a.zarr").values, colours)
@@ -153,7 +157,8 @@ def test_a_tilt_series_becomes_a_volume(variant_rgb: str, tmp_path: Path) -> Non
     (tmp_path / "series.rawtlt").write_text("\n".join(map(str, np.linspace(-60, 60, 41))))
     flags = ["-o", str(tmp_path / "run"), "--set", "solve.iterations=3", "--set", "held_out_every=0"]
     assert main(["optimize", str(tmp_path / "series.mrc"), *flags]) == 0
-    assert read_volume(tmp_path / "run/volumes/reconstruction.npz").values.shape == (12, 32, 32, 1)
+    volume = read_volume(tmp_path / "run/volumes/reconstruction.npz")
+    assert volume.values.shape == (12, 32, 32, 1) and volume.meta["unit"] == "A"
 
 
 def test_a_tilt_series_without_air_or_without_angles(tmp_path: Path, capsys) -> None:

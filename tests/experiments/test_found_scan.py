@@ -45,7 +45,7 @@ def test_settings_of_a_nexus_file(tmp_path: Path) -> None:
     path = write_nxtomo(write_nxtomo(tmp_path / "a.nxs"), "entry2")
     draft = draft_scan(path)
     assert draft.raw["scan"] == {"beam": "parallel", "pitch": [0.004, 0.002]}
-    assert draft.raw["data"] == {"source": "measured", "file": str(path)}
+    assert draft.raw["data"] == {"source": "measured", "file": str(path)} and draft.raw["unit"] == "mm"
     assert "grid" not in draft.raw
     assert draft.lines[:2] == (
         "found: NXtomo, entry entry: 5 views of 2 x 3 pixels, 2 flats, 2 darks",
@@ -129,6 +129,18 @@ def test_flats_before_and_after_the_views_count_together(tmp_path: Path) -> None
     draft = draft_scan(folder)
     assert draft.raw["data"]["flats"] == f"{folder}/I*_before_*.tif"
     assert any("I#_after_#.tif, white_#.tif: not used" in line for line in draft.lines)
+
+
+def test_a_scanner_s_file_is_named(tmp_path: Path) -> None:
+    """It tells a scan from slices, though nothing is read from it."""
+    folder = write_tiffs(tmp_path / "scan")
+    (folder / "bone.log").write_text("[Acquisition]\nObject to Source (mm)=67.1\n")
+    assert any(line.startswith("found: bone.log: not read; if distances are in it, set") for line in draft_scan(folder).lines)
+    for file in folder.glob("[fd]*_*"):
+        file.unlink()
+    assert found_scan.has_scan_files(folder)
+    (folder / "bone.log").unlink()
+    assert not found_scan.has_scan_files(folder)
 
 
 def test_a_file_of_pages_is_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
