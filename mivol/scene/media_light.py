@@ -174,7 +174,7 @@ def _estimate_variances(table: EmissionTable, p: mi.Point3f, normal: mi.Vector3f
 
     u, warp = sampler.next_2d(), mi.warp
     around = warp.square_to_uniform_sphere(u) if frame is None else frame.to_world(warp.square_to_cosine_hemisphere(u))
-    towards = dr.normalize(table.sample_point(sampler.next_1d(), [sampler.next_1d() for _ in range(3)]) - p)
+    towards = dr.normalize(table.sample_point(sampler.next_1d(), [sampler.next_1d() for _ in range(4)]) - p)
     met, aimed = (table.integrate_density(p, d, on) for d in (around, towards))
     a, b = own(around), own(towards)
     met_weighed = met.light * power_heuristic(a, met.pdf)
@@ -194,5 +194,5 @@ class MediaLight:
     """
 
     density: mi.Float
-    cumulative: mi.Float
+    cumulative: mi.Float64
     gain: float = 0.0

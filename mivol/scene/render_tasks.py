@@ -47,7 +47,7 @@ class PreparedArrays:
     """
 
     readings: Readings
-    light: tuple[mi.Float, mi.Float] | None
+    light: tuple[mi.Float, mi.Float64] | None
     views: mi.SensorPtr | None
     placements: mi.Float64 | None = None
     tracer: mi.Scene | None = None

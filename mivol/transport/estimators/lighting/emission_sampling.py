@@ -56,8 +56,10 @@ __all__ = [
 ]
 
 
-CELLS_PER_AXIS = 16
-"""Cells of a box along each axis."""
+CELLS_PER_AXIS = 32
+"""Cells of a box along each axis. Variance and processor time in an explosion of 160 x 160 x 240 nodes with 16, 32 and 64: on
+the floor below it, without scattering, 5.1e-4, 1.1e-4, 5.9e-5 and 1.56, 1.56, 1.85 s; in its smoke, depth 8, 0.015, 0.0076,
+0.0078 and 3.8, 4.3, 5.7 s. More points in a cell change nothing."""
 
 POINTS_PER_AXIS = 2
 """Points of a cell along each axis, at which the emission is evaluated."""
@@ -135,17 +137,23 @@ class EmissionTable:
     Attributes:
         boxes: boxes of the emitting media.
         density: density of each cell [1/length^3].
-        cumulative: cumulative probability of the cells [1].
+        cumulative: cumulative probability of the cells [1], in float64, since a cell may have a probability of 3e-6.
     """
 
     boxes: list[EmittingBox]
     density: mi.Float
-    cumulative: mi.Float
+    cumulative: mi.Float64
 
-    def sample_point(self, u: mi.Float, inside: list[mi.Float]) -> mi.Point3f:
-        """Sample a world position: its cell by ``u``, its place in the cell by three numbers; all uniform in [0, 1)."""
-        n = len(self.boxes) * CELLS_PER_AXIS**3
-        index = dr.binary_search(0, n - 1, lambda i: dr.gather(mi.Float, self.cumulative, i) <= u)
+    def sample_point(self, u: mi.Float, others: list[mi.Float]) -> mi.Point3f:
+        """Sample a world position by five numbers, uniform in [0, 1).
+
+        Args:
+            u: number of its cell.
+            others: three numbers of its place in the cell, and one for the digits of ``u`` below 2^-23.
+        """
+        *inside, digits = others
+        n, fine = len(self.boxes) * CELLS_PER_AXIS**3, mi.Float64(u) + mi.Float64(digits) * 2.0**-23
+        index = dr.binary_search(0, n - 1, lambda i: dr.gather(mi.Float64, self.cumulative, i) <= fine)
         k = index % CELLS_PER_AXIS**3
         cell = mi.Point3f(k % CELLS_PER_AXIS, k // CELLS_PER_AXIS % CELLS_PER_AXIS, k // CELLS_PER_AXIS**2) + mi.Point3f(
             *inside
@@ -218,7 +226,7 @@ def tabulate_emission(boxes: list[EmittingBox], channels: int) -> EmissionTable:
     total = dr.sum(power)
     share = dr.select(total > 0, power / dr.select(total > 0, total, 1), 1 / dr.width(power))
     share = dr.lerp(share, 1 / dr.width(power), UNIFORM_SHARE)
-    density, cumulative = share / volume, dr.cumsum(share)
+    density, cumulative = share / volume, dr.cumsum(mi.Float64(share))
     dr.eval(density, cumulative)
     return EmissionTable(boxes, density, cumulative)
 
@@ -294,7 +302,7 @@ class EmissionSampling:
         """
         media, it = self.media, vertex.interaction
         u, rng = samples
-        rng, (*place, along, chance) = draw_pcg32(rng, 5)
+        rng, (*place, along, chance) = draw_pcg32(rng, 6)
         d = dr.normalize(self.table.sample_point(u, place) - it.p)
         line = self.table.sample_along(it.p, d, along, active)
         f = dr.detach(vertex.eval(d, active))
