@@ -6,8 +6,8 @@ Pairs. Of a short list of photographs all pairs are matched. Of a long one or a 
 with neighbours in the order of names and with photographs that look alike (:func:`find_alike`), which close a walk around it.
 
 Global structure from motion (Pan et al. 2024) comes first. It averages the rotations of all photographs and finds all positions
-together, so errors do not add up along a chain of photographs. If it leaves out photographs, poses are also found one by one
-(Schönberger and Frahm 2016), and the larger model is kept.
+together, so errors do not add up along a chain of photographs. If it leaves out photographs, or has a doubtful error, poses are
+also found one by one (Schönberger and Frahm 2016), and the better model is kept (:func:`rate`).
 
 The job names ``images`` (folder), ``names`` (groups of photographs, one camera for each group), ``order`` (all photographs),
 ``masks`` (folder, or ""), ``database`` and ``models`` (where to write), ``sequential``, ``longest`` (edge of a photograph in
@@ -44,6 +44,9 @@ TURN, FOCAL, EQUAL = 0.1, (0.4, 1.6), 1.03
 """Least median shift of a turn of the camera, over the width; focal lengths that are tried, over the width; and the largest
 ratio of singular values that counts as equal."""
 
+DOUBTFUL = 0.7
+"""Mean reprojection error from which poses are also found one by one [pixel]."""
+
 FEWEST = 15
 """Common points of a pair with an overlap (COLMAP's ``min_num_inliers``)."""
 
@@ -71,14 +74,15 @@ def run(job: dict) -> None:
     together = Path(job["models"]) / "together"
     together.mkdir()
     found = write_models(pycolmap.global_mapping(database, images, together, options), together, job["aliases"])
-    if count_posed(found) < sum(map(len, job["names"])):
-        say(stage=f"{count_posed(found)} photographs have poses; poses one by one")
+    posed, _ = rate(found)
+    if posed < sum(map(len, job["names"])) or max(model["error"] for model in found) > DOUBTFUL:
+        say(stage=f"{posed} photographs have poses; poses one by one")
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed = 0
         apart = Path(job["models"]) / "one-by-one"
         apart.mkdir()
         others = write_models(pycolmap.incremental_mapping(database, images, apart, options), apart, job["aliases"])
-        found = max(found, others, key=count_posed)
+        found = max(found, others, key=rate)
     say(models=found)
 
 
@@ -217,9 +221,9 @@ def write_models(models: dict, place: Path, aliases: dict[str, str]) -> list[dic
     return found
 
 
-def count_posed(found: list[dict]) -> int:
-    """Photographs of the largest model."""
-    return max((len(model["names"]) for model in found), default=0)
+def rate(found: list[dict]) -> tuple[int, int]:
+    """Photographs of the largest model, and its points: with wrong poses, fewer matches agree on a point."""
+    return max(((len(model["names"]), model["points"]) for model in found), default=(0, 0))
 
 
 if __name__ == "__main__":

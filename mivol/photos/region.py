@@ -215,12 +215,12 @@ def is_free_space(cameras: Sequence[Camera], points: np.ndarray, reach: float) -
 
 
 def check_views(cameras: Sequence[Camera], box: np.ndarray) -> None:
-    """Refuse cameras without a ray through the box. 17 x 17 rays of each camera are tried, its corners included.
+    """Refuse cameras without a ray through the box (:func:`meets_box`).
 
     Raises:
         MivolError: names the first three of these cameras.
     """
-    missing = [camera.name for camera in cameras if not _meets_box(camera, box)]
+    missing = [camera.name for camera in cameras if not meets_box(camera, box)]
     if missing:
         names = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
         raise refusal(
@@ -231,7 +231,8 @@ def check_views(cameras: Sequence[Camera], box: np.ndarray) -> None:
         )
 
 
-def _meets_box(camera: Camera, box: np.ndarray) -> bool:
+def meets_box(camera: Camera, box: np.ndarray) -> bool:
+    """Whether a ray of a camera meets a box. 17 x 17 rays are tried, the corners included."""
     across = np.linspace(0, 1, 17)
     pixels = np.stack(np.meshgrid(across * camera.size[0], across * camera.size[1]), axis=-1)
     o, d = rays(camera, pixels)

@@ -142,7 +142,7 @@ def survey_photos(
             nested boxes, which some cameras may miss.
 
     Raises:
-        MivolError: no data set, a split without photographs, wrong cameras, or a camera looking away from the box.
+        MivolError: no data set, a split without photographs, wrong cameras, or a camera looking away from a given box.
     """
     path = Path(path)
     name, listing = _read(path)
@@ -162,11 +162,35 @@ def survey_photos(
     training = [entry for entry in present if entry.split in ("train", "held_out")]
     looking = [cameras[id(entry)] for entry in training or chosen]
     found_box, box_from = _box(box, listing, looking, path)
+    notes = [*listing.notes, *_note_changes(frames, [placed[id(entry)] for entry in chosen])]
     if not isinstance(box, str):
-        region.check_views([frame.camera for frame in frames], found_box)
+        frames, note = _leave_out_views(frames, found_box, box is not None)
+        notes += note
     near_far = region.near_and_far([*looking, *(frame.camera for frame in frames)], found_box)
-    notes = (*listing.notes, *_note_changes(frames, [placed[id(entry)] for entry in chosen]))
-    return PhotoSurvey(path, name, tuple(frames), tuple(absent), found_box, box_from, near_far, listing.points, notes=notes)
+    return PhotoSurvey(
+        path, name, tuple(frames), tuple(absent), found_box, box_from, near_far, listing.points, notes=tuple(notes)
+    )
+
+
+MOST_AWAY = 0.25
+"""Largest share of the photographs that may look away from a box that was found, and are left out."""
+
+
+def _leave_out_views(frames: list[PhotoFrame], box: np.ndarray, is_given: bool) -> tuple[list[PhotoFrame], list[str]]:
+    """The photographs that look at the box, and a note on the others.
+
+    Raises:
+        MivolError: photographs that look away from a given box, or more than ``MOST_AWAY`` of them from a box that was found.
+    """
+    meets = [region.meets_box(frame.camera, box) for frame in frames]
+    away = [frame.file.name for frame, does in zip(frames, meets, strict=True) if not does]
+    if is_given or len(away) > MOST_AWAY * len(frames):
+        region.check_views([frame.camera for frame in frames], box)
+    if not away:
+        return frames, []
+    named = ", ".join(away[:5]) + (" ..." if len(away) > 5 else "")
+    kept = [frame for frame, does in zip(frames, meets, strict=True) if does]
+    return kept, [f"left out: {named}, which by their poses look away from what the others show; their poses may be wrong"]
 
 
 def find_format(path: Path) -> str | None:

@@ -475,6 +475,32 @@ NAMES = {
 }
 
 
+def test_photographs_with_wrong_poses_are_left_out_and_named(tmp_path: Path) -> None:
+    """A camera turned around by a wrong pose; three of eight are too many to go on, and so is one beside a given box."""
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (100, 3))
+    folder = write_colmap(tmp_path, encoding="txt", n=8, points=points)
+    images = folder / "sparse" / "0" / "images.txt"
+
+    def turn_around(name: str) -> None:
+        lines = images.read_text().splitlines()
+        at = next(k for k, line in enumerate(lines) if line.endswith(name))
+        number, w, x, y, z, tx, ty, tz, *rest = lines[at].split(" ")
+        turned = (-float(y), float(z), float(w), -float(x), -float(tx), float(ty), -float(tz))
+        lines[at] = " ".join([number, *map(str, turned), *rest])
+        images.write_text("\n".join(lines) + "\n")
+
+    turn_around("a view 3.png")
+    survey = survey_photos(folder)
+    assert [frame.file.name for frame in survey.frames] == [f"a view {k}.png" for k in range(8) if k != 3]
+    assert "left out: a view 3.png, which by their poses look away" in survey.describe()
+    with pytest.raises(MivolError, match="1 of 8 cameras looking away from the box"):
+        survey_photos(folder, box=survey.box)
+    turn_around("a view 5.png")
+    turn_around("a view 6.png")
+    with pytest.raises(MivolError, match="3 of 8 cameras looking away from the box"):
+        survey_photos(folder)
+
+
 @pytest.mark.parametrize("encoding", ["bin", "txt"])
 def test_the_box_of_colmap_points_excludes_outliers(tmp_path: Path, encoding: str) -> None:
     rng = np.random.default_rng(6)

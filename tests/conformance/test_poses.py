@@ -275,25 +275,40 @@ def test_pycolmap_is_asked_for(folder: Path, monkeypatch: pytest.MonkeyPatch) ->
         poses.find_poses(folder)
 
 
-@pytest.mark.parametrize(("together", "one_by_one", "kept"), [(5, None, 5), (3, 4, 4), (3, 2, 3), (0, 4, 4)])
-def test_poses_are_found_one_by_one_if_photographs_are_left_out(
+@pytest.mark.parametrize(
+    ("together", "one_by_one", "kept"),
+    [
+        ((5, 0.5, 7), None, 7),
+        ((3, 0.5, 7), (4, 0.5, 6), 6),
+        ((3, 0.5, 7), (2, 0.5, 9), 7),
+        ((0, 0.5, 0), (4, 0.5, 9), 9),
+        ((5, 0.9, 7), (5, 0.4, 9), 9),
+        ((5, 0.9, 7), (5, 0.8, 6), 7),
+    ],
+)
+def test_poses_are_found_one_by_one_if_photographs_are_left_out_or_points_disagree(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-    together: int,
-    one_by_one: int,
+    together: tuple[int, float, int],
+    one_by_one: tuple[int, float, int] | None,
     kept: int,
 ) -> None:
-    """The larger model is kept; if all photographs have poses, the second search does not run."""
+    """Photographs, reprojection error and points of the models, and the points of the model that is kept.
 
-    def make(count: int | None) -> Callable[..., dict]:
+    If all photographs have poses of a small error, the second search does not run.
+    """
+
+    def make(found: tuple[int, float, int] | None) -> Callable[..., dict]:
+        count, error, points = found or (None, 0.0, 0)
+
         def search(database: Path, images: Path, models: Path, options: object) -> dict:
             assert count is not None and options.random_seed == 0 and models.is_dir()
             model = SimpleNamespace(
                 images={k: SimpleNamespace(name=f"{k}.png", has_pose=k < count) for k in range(5)},
-                write=lambda folder: (folder / "cameras.bin").write_text(str(count)),
-                compute_mean_reprojection_error=lambda: 0.5,
-                num_points3D=lambda: 7,
+                write=lambda folder: (folder / "cameras.bin").write_text(str(points)),
+                compute_mean_reprojection_error=lambda: error,
+                num_points3D=lambda: points,
                 num_cameras=lambda: 1,
             )
             return {0: model} if count else {}
@@ -316,8 +331,8 @@ def test_poses_are_found_one_by_one_if_photographs_are_left_out(
     colmap_process.run(job | {"database": str(tmp_path / "db"), "models": str(tmp_path / "models")})
     said = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     (model,) = said[-1]["models"]
-    assert len(model["names"]) == kept and (Path(model["folder"]) / "cameras.bin").read_text() == str(kept)
-    assert any("one by one" in facts.get("stage", "") for facts in said) == (together < 5)
+    assert model["points"] == kept and (Path(model["folder"]) / "cameras.bin").read_text() == str(kept)
+    assert any("one by one" in facts.get("stage", "") for facts in said) == (one_by_one is not None)
 
 
 def test_a_photograph_of_another_thing_is_named() -> None:
