@@ -82,15 +82,15 @@ def ct_scan(res: int) -> Extinction:
     return made_up((res,) * 3, 2.0, "no data folder" if res == 256 else "quick")
 
 
-def threads_in_space(res: int, share: float = 0.01) -> Extinction:
-    """Thin curved threads in a ``share`` of res^3 voxels; all other voxels are exactly 0."""
+def threads_in_space(res: int) -> Extinction:
+    """Thin curved threads in 1 % of res^3 voxels; all other voxels are exactly 0."""
     rng = np.random.default_rng(0)
     values = np.zeros((res,) * 3, np.float32)
     offsets = np.stack(np.meshgrid(*[np.arange(-3, 4)] * 3, indexing="ij"), -1).reshape(-1, 3)
     stamp = np.maximum(0, 1 - np.sum(offsets**2, axis=1) / 10).astype(np.float32)
     offsets, stamp = offsets[stamp > 0], stamp[stamp > 0]
     s = np.linspace(0, 2 * np.pi, 2 * res)[:, None]
-    while np.count_nonzero(values) < share * values.size:
+    while np.count_nonzero(values) < 0.01 * values.size:
         a, b, c = rng.uniform(-0.3, 0.3, (3, 3))
         curve = 0.5 + a * np.cos(s) + b * np.sin(s) + c * np.cos(2 * s) / 2
         nodes = np.clip(np.rint(curve * res).astype(int)[:, None] + offsets, 0, res - 1)

@@ -31,7 +31,7 @@ def say(line: str) -> None:
 
 
 @contextmanager
-def open_workers(where: str, variant: str, threads: int = 0) -> Iterator[Pool]:
+def open_workers(where: str, variant: str, threads: int) -> Iterator[Pool]:
     """The workers of ``--cluster``; Ctrl-C while they start ends the command, and lost workers are told at the end.
 
     Raises:

@@ -420,7 +420,7 @@ class Pool:
         lost = f", {self.lost} lost, {self.repeated} repeated" if self.lost else ""
         return f"{count} worker{'s' * (count != 1)}{lost}"
 
-    def collect_progress(self, timeout: float = 2.0) -> dict[Any, str]:
+    def collect_progress(self, timeout: float) -> dict[Any, str]:
         """Newest progress of the work under way, by the key of the unit; workers that do not answer in time are left out."""
         busy = [worker for worker in self.workers.values() if worker.units]
         answers: queue.SimpleQueue[tuple[Any, str]] = queue.SimpleQueue()

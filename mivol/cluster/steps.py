@@ -141,7 +141,7 @@ class Steps:
     """
 
     def __init__(
-        self, pool: Pool, make: Callable[[Workplace, Any], Twin], content: Any, needs: Sequence[str] = (), key: str = ""
+        self, pool: Pool, make: Callable[[Workplace, Any], Twin], content: Any, needs: Sequence[str] = ()
     ) -> None:
         """Register a twin as an input of work.
 
@@ -150,14 +150,13 @@ class Steps:
             make: function of a module of mivol that makes the twin of a worker from ``content``.
             content: of the twin.
             needs: content hashes of other inputs that ``make`` reads.
-            key: what the hash of the twin begins with.
 
         Raises:
             MivolError: inputs larger than half of the memory of a worker.
         """
         data = zlib.compress(to_bytes((make, content)), 1)
         self.pool, self.times, self.state = pool, StepTimes(), ""
-        self.twin = pool.share(hashlib.sha256(key.encode() + data).hexdigest(), data, len(data))
+        self.twin = pool.share(hashlib.sha256(data).hexdigest(), data, len(data))
         self.needs = (*needs, self.twin)
         self._known: dict[str, Any] = {}
 

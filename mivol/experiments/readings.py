@@ -54,7 +54,7 @@ class ScanReadings:
     notes: tuple[str, ...] = ()
 
 
-def read_scan(settings: config.ScanExperiment, base: Path, rows: slice = ALL) -> ScanReadings:
+def read_scan(settings: config.ScanExperiment, base: Path, rows: slice) -> ScanReadings:
     """Read a measured scan, or some rows of its detector, counted upwards.
 
     Raises:

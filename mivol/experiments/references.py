@@ -72,7 +72,7 @@ def find_references(
     truth: np.ndarray | None,
     sensors: Sequence[Any],
     held_out: frozenset[int],
-    complete: Complete | None = None,
+    complete: Complete | None,
 ) -> References:
     """Render or read the reference of each view; renders show the truth if known.
 

@@ -73,7 +73,7 @@ def make_sampled_batches(photos: Photos) -> RayBatches:
     return RayBatches.from_photos([rectify(view) for view in photos.views], space=photos.space)
 
 
-def make_sampled_problem(plan: SampledPlan, photos: Photos, seed: int = 0) -> SampledProblem:
+def make_sampled_problem(plan: SampledPlan, photos: Photos, seed: int) -> SampledProblem:
     """The fit of photographs with a box, before its first step."""
     return SampledProblem(make_sampled_batches(photos), photos.box, plan, seed)
 

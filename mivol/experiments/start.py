@@ -263,7 +263,7 @@ def check_given_start(name: str, value: np.ndarray) -> None:
         raise MivolError(f"{name} starts from a mean of {value.mean():.4g}, an emissive start needs a mean above 0: set start.")
 
 
-def fit_emission(views: Sequence[View], to_world: np.ndarray, seed: int = 0) -> SphericalGrid:
+def fit_emission(views: Sequence[View], to_world: np.ndarray, seed: int) -> SphericalGrid:
     """The radiance field of some views, in the axis-aligned box around the box ``to_world``."""
     corners = np.array([[x, y, z, 1.0] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) @ to_world.T
     box = np.array([corners[:, :3].min(axis=0), corners[:, :3].max(axis=0)])

@@ -76,7 +76,7 @@ class Sweep:
     folder: Path
     keys: tuple[str, ...]
     runs: tuple[SweepRun, ...]
-    command: str = ""
+    command: str
 
     def context(self, run: SweepRun, progress: Progress | None = None) -> RunContext:
         """The context of a run, which continues from a checkpoint of an interrupted run with the same settings."""
@@ -144,7 +144,7 @@ def _parse_value(word: str) -> Any:
 
 
 def plan_sweep(
-    path: Path, over: Sequence[str], changes: Sequence[str] = (), folder: Path | None = None, command: str = ""
+    path: Path, over: Sequence[str], changes: Sequence[str], folder: Path | None = None, command: str = ""
 ) -> Sweep:
     """Make and check the settings of all runs.
 

@@ -85,7 +85,7 @@ SAMPLED_KINDS = {
 """Arrays of such a field of any kind -> allowed kinds of NumPy types, and the shape where it is fixed."""
 
 
-def write_sampled_archive(path: Path, field: SampledField, half: bool = True, view: HomeView | None = None) -> None:
+def write_sampled_archive(path: Path, field: SampledField, half: bool, view: HomeView | None) -> None:
     """Write a fitted field that is known at points in mivol's own format.
 
     Args:

@@ -73,10 +73,10 @@ class WriteOptions:
         view: first view, which ``.npz`` keeps and a scene shows; other formats leave it out.
     """
 
-    level: float | None = None
-    sky: Sky | None = None
-    half: bool = True
-    view: HomeView | None = None
+    level: float | None
+    sky: Sky | None
+    half: bool
+    view: HomeView | None
 
 
 @dataclass(frozen=True)

@@ -207,7 +207,7 @@ def grid_to_gaussians(field: SphericalGrid, resolution: int | None = None) -> Ga
     )
 
 
-def nested_to_gaussians(field: SphericalGrid, resolution: int | None = None) -> Gaussians:
+def nested_to_gaussians(field: SphericalGrid, resolution: int | None) -> Gaussians:
     """Gaussians of a nested field: those of each level, outside of the box of the level before (:func:`grid_to_gaussians`).
 
     Raises:
@@ -242,7 +242,7 @@ def _encode_harmonics(field: SphericalGrid, harmonics: np.ndarray) -> np.ndarray
     """Harmonics (n, K, 3) in the world frame, of code values minus 1/2, as Gaussians hold them, float64."""
     harmonics = harmonics[:, : (HIGHEST_DEGREE + 1) ** 2].astype(np.float64)
     basis = harmonics.shape[1]
-    d = _fibonacci_directions()
+    d = _fibonacci_directions(64)
     own = _stack_columns(field.eval_basis(d)[:basis])
     back = np.linalg.pinv(_stack_columns(dr.sh_eval(d, math.isqrt(basis) - 1)))
     if field.space == "srgb":
@@ -265,7 +265,7 @@ LIGHT_CHUNK = 1 << 14
 """Nodes whose light is evaluated at once."""
 
 
-def _fibonacci_directions(count: int = 64) -> mi.Vector3f:
+def _fibonacci_directions(count: int) -> mi.Vector3f:
     """Unit directions spread evenly over the sphere (a Fibonacci lattice)."""
     height = 1 - (2 * np.arange(count) + 1) / count
     turn, flat = math.pi * (3 - math.sqrt(5)) * np.arange(count), np.sqrt(1 - height**2)

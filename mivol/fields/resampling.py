@@ -147,7 +147,7 @@ GRID_NODES = 128
 """Default number of nodes along the longest edge of such a grid."""
 
 
-def sample_to_grid(field: SampledField | SphericalGrid, resolution: int = GRID_NODES) -> SphericalGrid:
+def sample_to_grid(field: SampledField | SphericalGrid, resolution: int) -> SphericalGrid:
     """The grid of a hash grid, a NeRF or a nested grid, with ``resolution`` nodes along the longest edge of its whole box.
 
     Raises:
@@ -226,7 +226,7 @@ def _nodes_near_matter(field: SphericalGrid, res: tuple[int, int, int], to_world
     return np.flatnonzero(np.stack(found))
 
 
-def project_colours(field: SampledField | SphericalGrid, places: np.ndarray, degree: int = 2) -> np.ndarray:
+def project_colours(field: SampledField | SphericalGrid, places: np.ndarray, degree: int) -> np.ndarray:
     """Harmonics (n, basis, 3) of a field's colours at places (n, 3), by least squares over ``DIRECTIONS`` directions."""
     return np.concatenate([_project_colours(field, places[k : k + NODES], degree) for k in range(0, len(places), NODES)])
 

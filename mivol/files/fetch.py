@@ -175,7 +175,7 @@ def resolve_path(base: Path, named: str) -> Path:
 # -- Fetching -----------------------------------------------------------------------------------------------------
 
 
-def fetch_data(data: DataSet, folder: Path | None = None, watch: Callable[[int], None] = lambda done: None) -> Path:
+def fetch_data(data: DataSet, folder: Path | None, watch: Callable[[int], None] = lambda done: None) -> Path:
     """Download a data set, unless a complete copy exists.
 
     Args:

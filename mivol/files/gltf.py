@@ -176,9 +176,9 @@ def write_glb_mesh(
     file: BinaryIO,
     points: np.ndarray,
     faces: np.ndarray,
-    normals: np.ndarray | None = None,
-    colours: np.ndarray | None = None,
-    up: Sequence[float] = (0.0, 0.0, 1.0),
+    normals: np.ndarray | None,
+    colours: np.ndarray | None,
+    up: Sequence[float],
     texture: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> None:
     """Write a triangle mesh.

@@ -150,7 +150,7 @@ class ScanFacts(NamedTuple):
 
 
 def survey_projections(
-    path: str | os.PathLike, group: str = "", names: Mapping[str, str] | None = None, angle_unit: str | None = None
+    path: str | os.PathLike, group: str, names: Mapping[str, str] | None, angle_unit: str | None
 ) -> ScanFacts:
     """Find what a scan's file tells without its readings.
 

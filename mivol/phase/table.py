@@ -184,7 +184,7 @@ def check_values(values: np.ndarray, name: str) -> None:
 
 
 def adapt_nodes(
-    density: Callable[[np.ndarray], np.ndarray], tolerance: float, least: int = 33, relative_to_peak: bool = False
+    density: Callable[[np.ndarray], np.ndarray], tolerance: float, least: int, relative_to_peak: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Choose cosines so that straight lines between them follow a function.
 

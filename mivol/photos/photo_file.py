@@ -58,7 +58,7 @@ CONVERSIONS: dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-def find_colour_space(path: Path, stored: str | None = None) -> str:
+def find_colour_space(path: Path, stored: str | None) -> str:
     """Return the colour space of a file: "linear" (OpenEXR, and PNG with a gAMA chunk of 1) or "srgb".
 
     Args:

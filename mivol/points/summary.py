@@ -69,7 +69,7 @@ def summarize_file(path: Path) -> FileSummary:
     return FileSummary("\n".join([*lines(path, contents), *([f"refused\n{refused}"] if refused else [])]), refused)
 
 
-def convert_file(source: Path, target: Path, kind: str | None = None, box: Sequence[float] | None = None) -> str:
+def convert_file(source: Path, target: Path, kind: str | None, box: Sequence[float] | None) -> str:
     """Write the Gaussians or points of a file in another format.
 
     Args:

@@ -140,7 +140,7 @@ def arrange_cameras(survey: PhotoSurvey) -> Arrangement:
     return Arrangement(strokes, survey.box, _points(survey), up, survey.levels, bool(mean_up[up] < 0))
 
 
-def plot_arrangement(arranged: Arrangement, title: str, path: str | Path | None = None, part: str | None = None) -> Figure:
+def plot_arrangement(arranged: Arrangement, title: str, path: str | Path | None, part: str | None) -> Figure:
     """Plot an arrangement from the side and from above.
 
     Args:

@@ -259,7 +259,7 @@ def _show_pixels(axes: Axes, rgb: NDArray[np.uint8], aspect: float) -> None:
     axes.spines[:].set(visible=True, color=GRID)
 
 
-def _draw_colour_bar(figure: Figure, axes: Sequence[Axes], scale: pixel_scale.Scale, label: str, below: bool = False) -> None:
+def _draw_colour_bar(figure: Figure, axes: Sequence[Axes], scale: pixel_scale.Scale, label: str, below: bool) -> None:
     if scale.kind == "colour":
         return
     mappable = mpl.cm.ScalarMappable(

@@ -373,9 +373,9 @@ class Needs(ShapeFacts):
     places: tuple[str, ...]
     film_samples: int
     spp: int
-    is_colour_film: bool = True
-    are_samples_independent: bool = True
-    emitter_distances: tuple[float, ...] = ()
+    is_colour_film: bool
+    are_samples_independent: bool
+    emitter_distances: tuple[float, ...]
     near_gain: float | None = None
     lamp_noise: tuple[float, float] | None = None
     emission_noise: EmissionNoise | None = None
@@ -407,7 +407,7 @@ class Needs(ShapeFacts):
         views = (b.view(survey.places) for b in self.boundaries)
         return replace(self, views=tuple(replace(v, asymmetry=g) for v, g in zip(views, asymmetries, strict=True)))
 
-    def make_media(self, scene: mi.Scene, bodies: Sequence[Body], size: float, tracer: mi.Scene | None = None) -> SceneMedia:
+    def make_media(self, scene: mi.Scene, bodies: Sequence[Body], size: float, tracer: mi.Scene | None) -> SceneMedia:
         """Build the media of the scene among its surfaces.
 
         Args:

@@ -359,7 +359,7 @@ def noise(p: mi.Point3f, table: mi.UInt32) -> mi.Float:
     return corners[0]
 
 
-def noise_gradient(p: mi.Point3f, table: mi.UInt32, step: float = 0.01) -> mi.Vector3f:
+def noise_gradient(p: mi.Point3f, table: mi.UInt32) -> mi.Vector3f:
     """The gradient of :func:`noise` by forward differences, as pbrt takes it."""
-    here = noise(p, table)
+    step, here = 0.01, noise(p, table)
     return mi.Vector3f(*(noise(p + mi.Vector3f(*(step * np.eye(3)[axis]).tolist()), table) - here for axis in range(3))) / step

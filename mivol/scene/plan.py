@@ -131,20 +131,20 @@ class Plan:
     scattering_points: int
     pass_rays: int
     gradient_bytes: int
-    side_flight_cosine: float | None = None
-    draws_emission: bool = False
-    successive_paths: int = 1
-    branches: bool = False
-    image_branches: int = 1
-    draws_near_light: bool = False
-    near_light_in_derivatives: bool = False
-    near_emitters: tuple[int, ...] = ()
-    are_thick: tuple[bool, ...] = ()
-    have_low_albedo: tuple[bool, ...] = ()
-    occupied: float | None = None
-    lamp_rays: int = 0
-    shadow_nodes: int = 0
-    emission_rays: int = 0
+    side_flight_cosine: float | None
+    draws_emission: bool
+    successive_paths: int
+    branches: bool
+    image_branches: int
+    draws_near_light: bool
+    near_light_in_derivatives: bool
+    near_emitters: tuple[int, ...]
+    are_thick: tuple[bool, ...]
+    have_low_albedo: tuple[bool, ...]
+    occupied: float | None
+    lamp_rays: int
+    shadow_nodes: int
+    emission_rays: int
 
     @property
     def decisions(self) -> tuple:

@@ -58,7 +58,7 @@ class GridReading:
     bounds: mi.Float | mi.Bool | None
     occupied: float
     maximum: float
-    floored: mi.Float | None = None
+    floored: mi.Float | None
     extremes: BlockExtremes | None = None
     pattern: bytes | None = None
 

@@ -49,8 +49,8 @@ class PreparedArrays:
     readings: Readings
     light: tuple[mi.Float, mi.Float64] | None
     views: mi.SensorPtr | None
-    placements: mi.Float64 | None = None
-    tracer: mi.Scene | None = None
+    placements: mi.Float64 | None
+    tracer: mi.Scene | None
     asymmetries: list[mi.Float | None] = field(default_factory=list)
 
 

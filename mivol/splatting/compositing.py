@@ -84,7 +84,7 @@ class Frame:
     depth: bool
     median: bool
     remembers: bool
-    discs: bool = False
+    discs: bool
 
 
 @dataclass

@@ -73,7 +73,7 @@ class EllipsoidPhantom:
             field += value * (np.einsum("...i,...i", q, q) <= 1.0)
         return field
 
-    def voxelise(self, grid: VoxelGrid, supersampling: int = 2) -> np.ndarray:
+    def voxelise(self, grid: VoxelGrid, supersampling: int) -> np.ndarray:
         """Mean of the field over sub-points of each voxel.
 
         Args:

@@ -63,8 +63,8 @@ class Calibration:
     gain: float
     n_flats: int
     n_darks: int
-    saturation: float = np.inf
-    notes: tuple[str, ...] = ()
+    saturation: float
+    notes: tuple[str, ...]
 
     def signal(self, readings: np.ndarray) -> np.ndarray:
         """Readings minus the dark reading; NaN at dead or saturated pixels."""

@@ -239,7 +239,7 @@ def score_image(
     return ImageScore(name, {m: METRICS[m].measure(filled, photograph) + offset * (m == "psnr") for m in metrics})
 
 
-def fit_colours(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+def fit_colours(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     """Fit each channel of an image to its photograph by a x + b, with least squares over counting pixels.
 
     A camera may choose another exposure or white balance for a held-out view. The fitted image shows the quality of the field

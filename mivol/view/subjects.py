@@ -257,7 +257,7 @@ class SceneSubject(Subject):
 
     space, is_noisy = "linear", True
 
-    def __init__(self, path: Path, defines: Mapping[str, str] | None = None) -> None:
+    def __init__(self, path: Path, defines: Mapping[str, str] | None) -> None:
         loaded = load_scene(path, defines or {})
         self.name, self.scene = loaded.name, loaded.scene
         self.integrator = choose_integrator(self.scene, None if self.scene.integrator() else "mivol")

@@ -102,8 +102,12 @@ def test_a_run_shows_its_newest_model_and_reads_it_again(tmp_path: Path) -> None
     assert subject.draw(CAMERA, Look()).max() > 0.5
 
 
-def test_a_run_shows_its_photographs_before_it_has_a_model(tmp_path: Path) -> None:
-    """The path in the folder starts at the folder; the first model replaces the points and keeps the cameras."""
+def test_a_run_shows_its_photographs_before_it_has_a_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The path in the folder starts at the folder; the first model replaces the points and keeps the cameras.
+
+    The viewer of an unfinished run gives way to the fit. All further tests of this process would give way, too."""
+    steps = []
+    monkeypatch.setattr("os.nice", lambda step: steps.append(step) or 0)
     (tmp_path / "photos").mkdir()
     write_transforms(tmp_path / "photos", {"fl_x": 10.0, "w": 12, "h": 8})
     run = RunFolder(tmp_path / "runs" / "a", RunRecord.new("a run"))
@@ -111,6 +115,7 @@ def test_a_run_shows_its_photographs_before_it_has_a_model(tmp_path: Path) -> No
     run.write_photographs(tmp_path / "photos", 4, 1)
     assert str(tmp_path) not in (run.path / PHOTOGRAPHS).read_text(encoding="utf-8")
     subject = open_subject(run.path)
+    assert max(steps) == 19
     assert [frame.split == "train" for frame in subject.survey.frames] == [True, False, True, True]
     assert not subject.draw(CAMERA, Look()).any() and "no model" in subject.title
     with pytest.raises(MivolError, match="no model yet"):

@@ -87,7 +87,7 @@ def open_cluster(study: Study, args: argparse.Namespace) -> Iterator[Answer]:
             say(line)
 
 
-def run_study(name: str, argv: Sequence[str], older: Path | None = None) -> int:
+def run_study(name: str, argv: Sequence[str], older: Path | None) -> int:
     """Run a study.
 
     Args:

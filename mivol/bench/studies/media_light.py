@@ -36,9 +36,9 @@ AXIS_START = 0.1
 """Lower end of the bars in the figure."""
 
 
-def make_blobs(res: int = 32) -> NDArray[np.float32]:
-    """Two Gaussian blobs (Z, Y, X)."""
-    at = (np.arange(res) + 0.5) / res * 2 - 1
+def make_blobs() -> NDArray[np.float32]:
+    """Two Gaussian blobs (32, 32, 32)."""
+    at = (np.arange(32) + 0.5) / 16 - 1
     z, y, x = np.meshgrid(at, at, at, indexing="ij")
     wide = np.exp(-8 * ((x - 0.2) ** 2 + y**2 + (z + 0.1) ** 2))
     blobs = wide + 0.7 * np.exp(-20 * ((x + 0.4) ** 2 + (y - 0.3) ** 2 + (z - 0.3) ** 2))

@@ -46,7 +46,7 @@ class StorageSize(Size):
 # -- Measurement ------------------------------------------------------------------------------------------------------------
 
 
-def make_field(res: int, degree: int, share: float | None = None) -> SphericalGrid:
+def make_field(res: int, degree: int, share: float | None) -> SphericalGrid:
     """A field of density 1; ``share``: of the nodes, the nearest to the surface of a ball, are kept; None: dense."""
     axis = (np.arange(res) + 0.5) / res - 0.5
     distance = np.abs(np.sqrt(axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2) - 0.35)

@@ -43,7 +43,7 @@ class GradientSettings:
     depth: float
     near: float
     has_gains: bool
-    share: float = 1.0
+    share: float
 
 
 @dataclass
@@ -93,8 +93,8 @@ def differentiate_batch(
     settings: GradientSettings,
     model: FieldModel,
     batch: RayBatch,
-    background: mi.Color3f | None = None,
-    depth_rays: DepthRays | None = None,
+    background: mi.Color3f | None,
+    depth_rays: DepthRays | None,
 ) -> tuple[mi.Float, dict[str, mi.Float]]:
     """Squared error of each ray of a batch, weighted, mean over rgb, and derivatives of the mean over rays, by parameter.
 

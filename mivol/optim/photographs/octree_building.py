@@ -152,7 +152,7 @@ POINTS_DEPTH = 7
 
 
 def build_octree_of_points(
-    field: SampledField, rays: ViewRays, recipe: OctreeRecipe = OctreeRecipe(), degree: int = 2
+    field: SampledField, rays: ViewRays, recipe: OctreeRecipe, degree: int = 2
 ) -> Octree:
     """Make an octree straight from a hash grid or a NeRF.
 

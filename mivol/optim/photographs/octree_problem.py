@@ -68,7 +68,7 @@ class LeafPlan:
         stop: transmittance at which a ray ends.
     """
 
-    steps: int = 400
+    steps: int
     shrink: int = 1
     views: int = 4
     tiles: int = 1024
@@ -102,8 +102,8 @@ class OctreePlan:
     """
 
     grid: RadiancePlan | None
-    recipe: OctreeRecipe = dataclasses.field(default_factory=OctreeRecipe)
-    leaves: LeafPlan = dataclasses.field(default_factory=LeafPlan)
+    recipe: OctreeRecipe
+    leaves: LeafPlan
     random_background: bool = True
 
     @property

@@ -317,7 +317,7 @@ def join_slopes(each: list[dict[str, mi.Float]]) -> dict[str, mi.Float]:
 
 
 def find_region(
-    field: SampledField, cells: int = 128, samples_a_cell: float = 2.0, rounds: int = 8, seed: int = 0
+    field: SampledField, cells: int, samples_a_cell: float = 2.0, rounds: int = 8, seed: int = 0
 ) -> SampledField:
     """A field with its occupied cells, as rays and files need them: of a network that was not fitted here.
 

@@ -183,7 +183,7 @@ def solve_with_light(
     problem: LeastSquares,
     light: LightFit,
     every: int,
-    state: SolverState | None = None,
+    state: SolverState | None,
     **options: object,
 ) -> Iterator[SolverState]:
     """Iterations of a solver, with a new fit of the light after every ``every`` iterations.

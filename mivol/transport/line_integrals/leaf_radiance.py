@@ -113,7 +113,7 @@ class LeafHarmonics:
     tree: Octree
     table: mi.Float
     basis: list[mi.Float]
-    slope: mi.Float | None = None
+    slope: mi.Float | None
 
     @property
     def width(self) -> int:

@@ -204,7 +204,7 @@ def render_samples(model: SampledModel, rays: RayBundle, u: float | None = None)
     return rendered
 
 
-def render_hierarchical(model: SampledModel, rays: RayBundle, u: float | None = None) -> tuple[SampledRays, SampledRays]:
+def render_hierarchical(model: SampledModel, rays: RayBundle, u: float | None) -> tuple[SampledRays, SampledRays]:
     """Integrate along rays with samples in two rounds (:mod:`.hierarchical_samples`).
 
     Args:

@@ -65,7 +65,7 @@ BASELINE_SEED = 0x1E7E1
 # -- Branching paths -----------------------------------------------------------------------------------------------------
 
 
-def count_branches(stems: int, collided: mi.UInt32, noise: mi.Float | float = USUAL_NOISE) -> mi.UInt32:
+def count_branches(stems: int, collided: mi.UInt32, noise: mi.Float | float) -> mi.UInt32:
     """Number of branches of a path (an array of one number).
 
     Args:

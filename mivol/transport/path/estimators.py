@@ -93,7 +93,7 @@ class SegmentInputs:
     """
 
     direct: DirectLighting
-    count: int = 1
+    count: int
     visibility_cache: VisibilityCache | None = None
     transmittance_grid: TransmittanceGrid | None = None
 

@@ -113,7 +113,7 @@ class SideFlight:
     light: SideFlightLight
     shadow: DirectLight
     chance: mi.Float | None
-    tabulated: TabulatedShadow | None = None
+    tabulated: TabulatedShadow | None
 
 
 def estimate_side_flight(

@@ -350,7 +350,7 @@ def coarsen_grid(lattice: Lattice, shift: int, finds_occupied: bool) -> CoarseGr
     return CoarseGrid(place_blocks(lattice, values, shift, empty_distances), is_occupied)
 
 
-def place_blocks(lattice: Lattice, means: mi.TensorXf, shift: int, empty_distances: mi.UInt32 | None = None) -> Lattice:
+def place_blocks(lattice: Lattice, means: mi.TensorXf, shift: int, empty_distances: mi.UInt32 | None) -> Lattice:
     """Place the means of blocks of 2^shift voxels of a lattice as a grid of their own."""
     ratios = [(m << shift) / n for m, n in zip(means.shape[2::-1], lattice.res[::-1], strict=True)]
     return Lattice(means, lattice.to_world @ np.diag([*ratios, 1.0]), empty_distances)

@@ -42,11 +42,11 @@ class TutorialSize(Size):
     step_spp: tuple[int, ...] = amount((8, 64), (2, 4), "samples per pixel of the stages")
 
 
-def half_circle(side: int, count: int = 5) -> list[mi.Sensor]:
-    """Cameras of the tutorial: y is up, distance 4, from -90 degrees in steps of 36 degrees."""
+def half_circle(side: int) -> list[mi.Sensor]:
+    """The five cameras of the tutorial: y is up, distance 4, from -90 degrees in steps of 36 degrees."""
     sensors = []
-    for i in range(count):
-        turn = mi.ScalarTransform4f().rotate([0, 1, 0], 180.0 / count * i - 90.0)
+    for angle in range(-90, 90, 36):
+        turn = mi.ScalarTransform4f().rotate([0, 1, 0], angle)
         camera = perspective(side)
         camera["film"] = {"type": "hdrfilm", "width": side, "height": side, "rfilter": {"type": "tent"}}
         camera["to_world"] = turn @ mi.ScalarTransform4f().look_at(origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0])

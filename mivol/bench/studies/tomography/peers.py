@@ -24,7 +24,6 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import shift
@@ -119,13 +118,13 @@ def centre_axis(values: np.ndarray, column: float, order: int) -> np.ndarray:
     return np.ascontiguousarray(moved[..., middle - reach : middle + reach + 1])
 
 
-def load_tooth(settings: Path | None = None) -> MeasuredSlice:
+def load_tooth() -> MeasuredSlice:
     """The first layer of the tooth, in a grid with the number of voxels of the scene, or one more if this number is even.
 
     Raises:
         MivolError: the data is not on this machine.
     """
-    path = settings or examples_folder() / "tooth" / "fit.toml"
+    path = examples_folder() / "tooth" / "fit.toml"
     chosen = config.load(path)
     edge = chosen.grid.shape[1] // 2 * 2 + 1
     data = make_data(chosen, path.parent, make_grid(chosen, path.parent))

@@ -49,7 +49,7 @@ scattering events in cloud and smoke: 1.02 to 1.2 times less than without roulet
 
 
 def find_transmittance(
-    media: SceneMedia, ray: Ray, medium: mi.MediumPtr, active: mi.Bool, rng: mi.UInt32 | None = None
+    media: SceneMedia, ray: Ray, medium: mi.MediumPtr, active: mi.Bool, rng: mi.UInt32 | None
 ) -> tuple[SegmentEnd, list[mi.Float] | None, list[mi.Float] | None, mi.Spectrum]:
     """Follow a ray to the first opaque surface, and find its transmittance.
 
