@@ -22,7 +22,7 @@ from mivol.experiments.gaussian_conversion import EDGE, VIEWED, box_to_world, ca
 from mivol.fields.field_archives import read_field_view
 from mivol.fields.field_files import read_field, write_field
 from mivol.fields.gaussian_grid import gaussian_box, gaussians_to_grid, grid_to_gaussians, nested_to_gaussians
-from mivol.fields.octree import MAX_DEPTH, Octree, check_depth
+from mivol.fields.octree import MAX_DEPTH, Octree
 from mivol.fields.resampling import GRID_NODES, sample_to_grid
 from mivol.fields.sampled_field import SampledField
 from mivol.fields.spherical_grid import SphericalGrid
@@ -162,9 +162,8 @@ def convert_to_octree(path: Path, target: Path, resolution: int | None, variant:
     if resolution is not None:
         if isinstance(source.model, Octree):
             raise MivolError(f"{path} is an octree, whose leaves stay as they are: leave out --resolution.")
-        if resolution < 1:
-            raise MivolError(f"--resolution {resolution} asks for no leaf along an edge: give 1 to {2**MAX_DEPTH}.")
-        check_depth((resolution - 1).bit_length())
+        if not 1 <= resolution <= 2**MAX_DEPTH:
+            raise MivolError(f"--resolution {resolution} is no number of leaves along an edge: give 1 to {2**MAX_DEPTH}.")
     depth = 0 if resolution is None else max((resolution - 1).bit_length(), 1)
     tree = make_octree(source, OctreeRecipe(depth))
     write_field(target, tree, view=source.view)

@@ -113,8 +113,8 @@ PARTS = 2
 DIRECTIONS = 48
 """Directions of the colours that are projected onto harmonics: a Fibonacci lattice."""
 
-NODES = 1 << 13
-"""Nodes sampled at a time."""
+NODES, VOXELS = 1 << 13, 1 << 16
+"""Nodes whose colours are sampled at a time, and voxels whose densities are."""
 
 
 def sample_field(
@@ -179,9 +179,9 @@ def sample_voxels(
         )
     edge = voxel_edge(res, to_world)
     numbers, densities, centres = [], [], []
-    every = _nodes_near_matter(field, res, to_world) if isinstance(field, SphericalGrid) else np.arange(x * y * z)
-    for start in range(0, len(every), NODES):
-        node = every[start : start + NODES]
+    every = _nodes_near_matter(field, res, to_world) if isinstance(field, SphericalGrid) else range(x * y * z)
+    for start in range(0, len(every), VOXELS):
+        node = np.asarray(every[start : start + VOXELS])
         sigma, places = _sample_voxels(field, node, res, to_world)
         mean = sigma.mean(axis=1)
         kept = mean * edge > EMPTY
@@ -245,7 +245,10 @@ def _sample_voxels(
     if isinstance(field, SphericalGrid):
         sigma, _ = field.eval(p, mi.Vector3f(0, 0, 1))
     else:
-        sigma = dr.select(field.region.holds(p), field.density(p), 0)
+        held = dr.compress(field.region.holds(p))
+        sigma = dr.zeros(mi.Float, dr.width(p))
+        if dr.width(held):
+            dr.scatter(sigma, field.density(dr.gather(mi.Point3f, p, held)), held)
     return np.array(sigma, np.float64).reshape(len(node), -1), places
 
 

@@ -62,7 +62,7 @@ def test_leaves_as_large_as_asked_for(field: Path, capsys: pytest.CaptureFixture
     [
         ("tree.npz", [], "--to says what a field becomes: octree"),
         ("tree.ply", ["--to", "octree"], "--to octree makes an .npz: give"),
-        ("tree.npz", ["--to", "octree", "--resolution", "8192"], "depth 13"),
+        ("tree.npz", ["--to", "octree", "--resolution", "8192"], "8192 is no number of leaves along an edge: give 1 to 4096"),
         ("tree.npz", ["--to", "grid"], "is a grid of one box already"),
         ("tree.npz", ["--to", "octree", "--box", "0", "0", "0", "1", "1", "1"], "--box"),
     ],
