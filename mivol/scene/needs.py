@@ -85,6 +85,7 @@ def find_needs(
         replace(_read_medium_facts(b, view, survey, recording), misplaced=_find_misplaced(b, view, boundaries, survey))
         for b, view in zip(boundaries, views, strict=True)
     )
+    samples = spp or sensor.sampler().sample_count()
     needs = Needs(
         **vars(survey.facts),
         variant=mi.variant(),
@@ -94,8 +95,9 @@ def find_needs(
         start=sensor.get_medium(),
         camera_inside=_may_camera_be_inside(scene, sensor, survey),
         **_sort_parameters(differentiated),
-        film_samples=int(np.prod(sensor.film().crop_size())) * (spp or sensor.sampler().sample_count()),
-        spp=spp or sensor.sampler().sample_count(),
+        film_samples=int(np.prod(sensor.film().size())) * samples,
+        crop_samples=int(np.prod(sensor.film().crop_size())) * samples,
+        spp=samples,
         is_colour_film=not mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special),
         are_samples_independent=sensor.sampler().class_name() == "IndependentSampler",
         emitter_distances=_find_emitter_distances(
@@ -347,7 +349,9 @@ class Needs(ShapeFacts):
         camera_inside: whether the camera may be inside the box around a boundary.
         parameters: keys of the parameters with gradients enabled.
         places: keys among ``parameters`` that place shapes and sensors.
-        film_samples: pixels times samples per pixel of the sensor.
+        film_samples: pixels of the whole film times samples per pixel: a crop is planned as the whole film, so that it has the
+            same pixels.
+        crop_samples: the same of the crop that is rendered.
         spp: samples per pixel.
         is_colour_film: whether the film stores colours, and not quantities of its own.
         are_samples_independent: whether the sensor has Mitsuba's independent sampler, whose numbers others may replace.
@@ -372,6 +376,7 @@ class Needs(ShapeFacts):
     parameters: tuple[str, ...]
     places: tuple[str, ...]
     film_samples: int
+    crop_samples: int
     spp: int
     is_colour_film: bool
     are_samples_independent: bool

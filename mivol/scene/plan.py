@@ -210,9 +210,9 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     events, why = choose_scattering_points(needs, settings, segment)
     choices += why
     pass_rays = _rays_per_pass(needs)
-    passes = -(-needs.film_samples // pass_rays)
+    passes = -(-needs.crop_samples // pass_rays)
     choices.append(
-        Choice("passes", f"{passes} of at most {pass_rays} rays", f"{needs.film_samples} samples; a pass ends within seconds")
+        Choice("passes", f"{passes} of at most {pass_rays} rays", f"{needs.crop_samples} samples; a pass ends within seconds")
     )
     memory, choice = _plan_gradient_memory(needs)
     choices.append(choice)
@@ -299,7 +299,7 @@ def _plan_gradient_memory(needs: Needs) -> tuple[int, Choice]:
                 memory += 8 * VOXELS * bricks * channels
                 ways.add("added to the stored nodes")
                 continue
-            packs = needs.variant.startswith("llvm") and packs_gradient((z, y, x), channels, needs.film_samples)
+            packs = needs.variant.startswith("llvm") and packs_gradient((z, y, x), channels, needs.crop_samples)
             memory += (gradient_bytes((z, y, x), channels) if packs else 0) + 8 * z * y * x * channels
             ways.add("packed corners, one copy per thread" if packs else "added to the nodes")
     # Asking for the free memory takes as long as all other choices: a small step is not asked about.

@@ -500,7 +500,7 @@ def _measure_pixel_variance(sensor: mi.Sensor, estimators: Estimators) -> float:
 
 def _middle_pixels(sensor: mi.Sensor, side: int) -> tuple[Callable[[mi.UInt32], mi.Vector2u], mi.ScalarVector2f, int]:
     """The middle pixel of each of at most side x side cells of a film by its number, the film's size, and their count."""
-    width, height = (int(n) for n in sensor.film().crop_size())
+    width, height = (int(n) for n in sensor.film().size())
     columns, rows = min(width, side), min(height, side)
 
     def pixel(cell: mi.UInt32) -> mi.Vector2u:
@@ -547,5 +547,13 @@ def _walk_from(sensor: mi.Sensor, estimators: Estimators, sampler: mi.Sampler, p
 
 
 def _camera_ray(sensor: mi.Sensor, place: mi.Point2f) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-    """The ray through the middle of the lens from each place on the film, and its weight."""
-    return sensor.sample_ray_differential(mi.Float(sensor.shutter_open()), mi.Float(0.5), place, mi.Point2f(0.5))
+    """The ray through the middle of the lens from each place on the whole film [1], and its weight.
+
+    Mitsuba takes places on the crop. Cameras with a projection go on beyond it; previews of other sensors see the crop alone.
+    """
+    film = sensor.film()
+    if isinstance(sensor, mi.ProjectiveCamera):
+        place = (place * mi.ScalarVector2f(film.size()) - mi.ScalarVector2f(film.crop_offset())) / mi.ScalarVector2f(
+            film.crop_size()
+        )
+    return sensor.sample_ray_differential(mi.Float(sensor.shutter_open()), mi.Float(0.5), mi.Point2f(place), mi.Point2f(0.5))

@@ -190,7 +190,7 @@ class GradientTask(RenderTask):
                 estimators = self.build_estimators(scene, arrays)
             media = estimators.media
             media.find_followed()
-            media.start_gradients(self.needs.film_samples)
+            media.start_gradients(self.needs.crop_samples)
             # Deliver gradients of volumes after all passes: Dr.Jit follows the edge from a derived value to its parameter only
             # once.
             with dr.isolate_grad():

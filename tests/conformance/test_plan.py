@@ -32,6 +32,7 @@ def fog(*resolutions: tuple[int, int, int], **more: object) -> MediumFacts:
 
 def needs(*media: MediumFacts, variant: str = "llvm_ad_rgb", **more: object) -> SimpleNamespace:
     given = {"emitter_kinds": ("delta",), "parameters": (), "film_samples": 1000, "refractive": (), **more}
+    given = {"crop_samples": given["film_samples"], **given}
     return SimpleNamespace(media=media, variant=variant, **given)
 
 

@@ -16,6 +16,7 @@ from mivol.scene.previews import (
     DEPTHS,
     DepthError,
     SufficientDepth,
+    _camera_ray,
     find_sufficient_depth,
     last_order_share,
     measure_depth_error,
@@ -204,3 +205,17 @@ def test_a_light_without_a_name_is_told_by_its_kind(variant_rgb: str) -> None:
     )
     (line,) = (line for line in explain(scene, max_depth=4).splitlines() if line.startswith("  noise"))
     assert "DirectionalEmitter 1 makes 100%" in line
+
+
+@pytest.mark.parametrize("kind", ["perspective", "orthographic", "thinlens"])
+def test_previews_of_a_crop_see_the_whole_film(variant_rgb: str, kind: str) -> None:
+    """A crop is planned as the whole film; places on the film are float32, and rays end a few units in the last place apart."""
+    made = camera([1.0, -4.0, 0.5], [0, 0, 0], res=24) | {"type": kind}
+    if kind == "thinlens":
+        made |= {"aperture_radius": 0.1, "focus_distance": 4.0}
+    elif kind == "orthographic":
+        made.pop("fov")
+    crop = {"crop_width": 10, "crop_height": 9, "crop_offset_x": 7, "crop_offset_y": 8}
+    place = mi.Point2f([0.02, 0.4, 0.98], [0.97, 0.5, 0.03])
+    whole, part = (_camera_ray(mi.load_dict(made | {"film": made["film"] | more}), place)[0] for more in ({}, crop))
+    assert np.abs(np.array(whole.d - part.d)).max() < 4e-6 and np.abs(np.array(whole.o - part.o)).max() < 4e-6
