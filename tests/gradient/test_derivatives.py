@@ -21,9 +21,11 @@ from mivol.scene.plan import build_estimators, make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.flights.baseline import BLOCKS, BaselineSums
 from mivol.transport.estimators.scores import Replay
+from mivol.transport.estimators.segment import Collision
 from mivol.transport.path import derivatives
 from mivol.transport.path.derivatives import count_baseline_paths, count_branches, prepare_derivatives
-from mivol.transport.path.estimators import Settings
+from mivol.transport.path.estimators import Estimators, Settings
+from mivol.transport.path.walk import Path, walk_part
 from scenes import ball_of, box_of, camera, grid_volume, medium, skip_recorded_grids_on_a_gpu, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -88,22 +90,18 @@ def replays(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, np.ndarray, np.n
     seen: list[tuple] = []
     monkeypatch.setattr(derivatives, "BALANCE", 1e3)  # as many branches as there are lanes for
     # A recorded loop would hide the values.
-    monkeypatch.setattr(derivatives, "replay_in_one_kernel", lambda width, walk: walk())
+    monkeypatch.setattr(derivatives, "replay_in_one_kernel", lambda width, walk: [walk(mi.Bool(k == 0)) for k in range(2)])
 
-    def watch(name: str) -> None:
-        walk = getattr(derivatives, name)
+    def watched_walk(estimators: Estimators, path: Path, collision: Collision, stops: mi.Bool | None = None) -> Path:
+        before = path.score
+        path = walk_part(estimators, path, collision, stops)
+        if isinstance(before, Replay):
+            dr.eval(path.score.L)
+            name = "stems" if dr.all(stops) else "branches"
+            seen.append((name, np.array(before.L), np.array(path.score.L), np.array(before.dL)))
+        return path
 
-        def watched_walk(*args: object) -> tuple:
-            score, *rest = walk(*args)
-            if isinstance(score, Replay):
-                dr.eval(score.L)
-                seen.append((name, np.array(args[-1].L), np.array(score.L), np.array(args[-1].dL)))
-            return score, *rest
-
-        monkeypatch.setattr(derivatives, name, watched_walk)
-
-    watch("walk_stem")
-    watch("walk_branch")
+    monkeypatch.setattr(derivatives, "walk_part", watched_walk)
     return seen
 
 
@@ -112,7 +110,7 @@ def test_a_replay_finds_the_light_that_was_found(name: str, replays: list) -> No
     """Replayed branches, in another order, leave only rounding; replayed stems leave the mean light of their branches."""
     gradient_of_mean_image(SCENES[name](), KEYS["density"], 16, fresh(3), depth=7)
     (first, whole, left, _), (second, light, rest, _) = replays
-    assert (first, second) == ("walk_stem", "walk_branch")
+    assert (first, second) == ("stems", "branches")
     assert len(np.unique(light[0])) > 100
     # Some 20 terms of a path are subtracted one by one.
     assert np.abs(rest).max() <= 20 * 2**-24 * np.abs(light).max()

@@ -22,7 +22,7 @@ References: Arvo & Kirk 1990 (splitting); Vicini et al. 2021 (path replay).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -32,7 +32,7 @@ from mivol.transport.estimators.scores import Factor, Primal, Replay, Rest
 from mivol.transport.estimators.segment import SegmentTransmittance
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays
-from mivol.transport.path.walk import FirstCollision, walk_branch, walk_path, walk_stem
+from mivol.transport.path.walk import FirstCollision, Path, start_branch, start_stem, walk_part, walk_path, walk_stem
 from mivol.transport.traversal.random_numbers import SpreadSampler
 from mivol.transport.traversal.rays import clip_camera_ray
 
@@ -95,41 +95,49 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
     dr.schedule(dL)
     branching = _Branching.of(collision, first, USUAL_NOISE if baseline is None else baseline.noise)
     branches = branching.gather(lane)
-    primal, depth = branches.walk(replayed, Primal(dr.zeros(mi.Spectrum, n)))
-    light.add(primal.L * branching.share, branches.stem, branches.collision.on)
+    path = walk_part(
+        replayed, branches.start(replayed, Primal(dr.zeros(mi.Spectrum, n))), branches.collision.event(replayed.media)
+    )
+    light.add(path.score.L * branching.share, branches.stem, branches.collision.on)
     # One kernel walks the branches, adds their light to the stems, and counts them by length.
-    lengths = _Lengths.of(depth)
-    dr.eval(primal.L, lengths)
+    lengths = _Lengths.of(path.depth)
+    dr.eval(path.score.L, lengths)
 
     # -- Their replays ---------------------------------------------------------------------------------------------------
     order = lengths.sort()
-    branches, L = branching.gather(order), dr.gather(mi.Spectrum, primal.L, order)
+    branches, L = branching.gather(order), dr.gather(mi.Spectrum, path.score.L, order)
     dL_branch = dr.gather(mi.Spectrum, dL, branches.stem) * branching.share
 
-    def replay() -> None:
-        walk_stem(estimators, replayed_sampler, rays.ray, Replay(light.gather(lane), dL))
-        branches.walk(estimators, Replay(L, dL_branch))
+    stem_light = light.gather(lane)
+
+    def replay(is_stem: mi.Bool) -> None:
+        probes = ("first", "later")
+        stem = start_stem(estimators, replayed_sampler.clone(), rays.ray, Replay(stem_light, dL), *probes)
+        branch = branches.start(estimators, Replay(L, dL_branch), *probes)
+        branch.known = None if stem.known is None else stem.known.forget()
+        begun = branches.collision.event(estimators.media)
+        walk_part(estimators, dr.select(is_stem, stem, branch), replace(begun, on=begun.on & ~is_stem), is_stem)
 
     replay_in_one_kernel(n, replay)
 
 
-def replay_in_one_kernel(width: int, walk: Callable[[], object]) -> None:
-    """Walk paths backwards, and add all their derivatives in one kernel.
+def replay_in_one_kernel(width: int, walk: Callable[[mi.Bool], object]) -> None:
+    """Walk stems backwards, then branches, and add all their derivatives in one kernel.
 
     Dr.Jit sums the derivative by a single number (an albedo, the radiance of an emitter) over all lanes as soon as it is known.
-    Each sum would be a kernel that walks the paths anew. In a recorded loop the sums become atomic additions, so the walk is
-    the only turn of a loop.
+    Each sum would be a kernel that walks the paths anew. In a recorded loop the sums become atomic additions, and the code for
+    stems and branches is compiled once. So the two walks are the turns of a loop.
 
     Args:
         width: number of lanes.
-        walk: reports the paths to a :class:`Replay`; it changes gradients only.
+        walk: reports the stems (True) or the branches (False) to a :class:`Replay`; it changes gradients only.
     """
 
     def turn(number: mi.UInt32) -> tuple[mi.UInt32]:
-        walk()
+        walk(number == 0)
         return (number + 1,)
 
-    dr.while_loop(state=(dr.zeros(mi.UInt32, width),), cond=lambda number: number < 1, body=turn, label="replay")
+    dr.while_loop(state=(dr.zeros(mi.UInt32, width),), cond=lambda number: number < 2, body=turn, label="replay")
 
 
 @dataclass
@@ -226,9 +234,9 @@ class _Branches:
     collision: FirstCollision
     sampler: SpreadSampler
 
-    def walk(self, estimators: Estimators, score: Primal | Replay) -> tuple[Primal | Replay, mi.UInt32]:
-        """Walk the branches to their ends; return the score and the number of scattering events of each."""
-        return walk_branch(estimators, self.sampler.clone(), self.collision, score)
+    def start(self, estimators: Estimators, score: Primal | Replay, *probes: str) -> Path:
+        """Start to walk the branches at their collisions."""
+        return start_branch(estimators, self.sampler.clone(), self.collision, score, *probes)
 
 
 @dataclass

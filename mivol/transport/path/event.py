@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -65,6 +65,10 @@ class PathEvent:
         on = collision.on
         merged = {f.name: dr.select(on, getattr(collision, f.name), getattr(self.collision, f.name)) for f in fields(Collision)}
         return PathEvent(self.si, self.t, self.medium, self.at_surface, Collision(**merged), self.chance)
+
+    def omit_collisions(self, lanes: mi.Bool) -> PathEvent:
+        """These events, without the collisions of some lanes."""
+        return replace(self, collision=replace(self.collision, on=self.collision.on & ~lanes))
 
     def vertex(self, media: SceneMedia) -> Vertex:
         """The point at which light is scattered."""

@@ -23,13 +23,13 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.estimators.flights.free_flight import make_collision
 from mivol.transport.estimators.lighting.tabulated_shadows import KeptShadow
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.estimators.segment import KnownFlight
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.walk import (
     Path,
-    advance_branch,
     advance_path,
     film_alpha,
     gather_lanes,
@@ -192,7 +192,8 @@ def walk_branching(
         return start_branch(estimators, numbers, at, score), KnownFlight(at.t, at.body, active)
 
     def advance(path: Path, begun: KnownFlight, stem: mi.UInt32, branch: mi.UInt32, on: mi.Bool) -> tuple:
-        path, begun = advance_branch(estimators, path, begun), begun.forget()
+        hit = make_collision(estimators.media, path.ray, begun.t, begun.body, path.active & begun.on)
+        path, begun = advance_path(estimators, path, hit), begun.forget()
         # -- The light of all branches of a stem -------------------------------------------------------------------------
         next_one = on & ~path.active
         asks = next_one & (branch + 1 == each)

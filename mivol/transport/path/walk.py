@@ -37,6 +37,7 @@ from mivol.transport.estimators.segment import Collision, KnownFlight, PathSegme
 from mivol.transport.estimators.single_scattering.near_light import AimedDirections
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.channels import to_components
+from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.event import DirectionSamples, PathEvent, sample_next_direction
 from mivol.transport.path.side_flight import (
@@ -52,7 +53,6 @@ from mivol.transport.traversal.rays import FineRay, Ray, clip_camera_ray, point_
 __all__ = [
     "FirstCollision",
     "Path",
-    "advance_branch",
     "advance_path",
     "film_alpha",
     "gather_lanes",
@@ -60,7 +60,8 @@ __all__ = [
     "leave_camera",
     "start_branch",
     "start_path",
-    "walk_branch",
+    "start_stem",
+    "walk_part",
     "walk_path",
     "walk_stem",
 ]
@@ -175,6 +176,10 @@ class FirstCollision:
             self.on | on,
         )
 
+    def event(self, media: SceneMedia) -> Collision:
+        """The collisions as ends of segments."""
+        return make_collision(media, self.ray, self.t, self.body, self.on)
+
     def gather(self, index: mi.UInt32, active: mi.Bool = True) -> FirstCollision:
         """The collisions of other lanes, on where ``active``."""
         ray = self.ray
@@ -288,20 +293,21 @@ def walk_path(
     return path.score, film_alpha(path)
 
 
-def walk_stem(estimators: Estimators, sampler: SpreadSampler, ray: Ray, score: Score) -> tuple[Score, FirstCollision, mi.Float]:
+def walk_stem(
+    estimators: Estimators, sampler: SpreadSampler, ray: Ray, score: Primal
+) -> tuple[Primal, FirstCollision, mi.Float]:
     """Walk a path from the camera, and stop at its first collision with a medium.
 
     Args:
         estimators: estimators of the render; their segments end in media.
-        sampler, ray, score: as in :func:`walk_path`.
+        sampler, ray: as in :func:`walk_path`.
+        score: accumulator of radiance.
 
     Returns:
-        The score, the first collisions, from which :func:`walk_branch` continues, and the alpha for the film, in [0, 1].
+        The score, the first collisions, at which branches begin (:func:`start_branch`), and the alpha for the film, in [0, 1].
     """
     media, n = estimators.media, dr.width(ray)
-    path = start_path(estimators, clip_camera_ray(ray), score, sampler, dr.full(mi.Bool, True, n))
-    path = find_first_collision(estimators, leave_camera(estimators, path, media.medium_at(ray)))
-    path = _start_reservoirs(estimators, path, *(("first", "later") if media.has_surfaces else ("first",)))
+    path = start_stem(estimators, sampler, ray, score)
 
     def advance(path: Path, first: FirstCollision) -> tuple[Path, FirstCollision]:
         path, event = _follow_segment(estimators, path)
@@ -312,8 +318,7 @@ def walk_stem(estimators: Estimators, sampler: SpreadSampler, ray: Ray, score: S
             path.active = dr.full(mi.Bool, False, n)
             return path, first
         # Paths that collide stop; the others continue behind the surface.
-        without = replace(event, collision=replace(hit, on=dr.full(mi.Bool, False, n)))
-        return _scatter(estimators, path, without), first
+        return _scatter(estimators, path, event.omit_collisions(dr.full(mi.Bool, True, n))), first
 
     first = FirstCollision.none(path)
     if media.has_surfaces:
@@ -323,23 +328,26 @@ def walk_stem(estimators: Estimators, sampler: SpreadSampler, ray: Ray, score: S
     return _add_reservoirs(estimators, path).score, first, dr.select(first.on, 1, film_alpha(path))
 
 
-def walk_branch(
-    estimators: Estimators, sampler: SpreadSampler, collision: FirstCollision, score: Score
-) -> tuple[Score, mi.UInt32]:
-    """Walk a path from its first collision to its end.
+def walk_part(estimators: Estimators, path: Path, collision: Collision, stops: mi.Bool | None = None) -> Path:
+    """Walk stems, branches or both, each in its lanes.
 
     Args:
-        estimators, score: as in :func:`walk_path`.
-        sampler: random numbers, independent of the path up to the collision.
-        collision: first collision of the path.
+        estimators: estimators of the render; their segments end in media.
+        path: paths from :func:`start_stem` or :func:`start_branch`.
+        collision: collisions at which branches begin; off in the lanes of stems.
+        stops: lanes of stems, which end at their first collision; None without stems.
 
     Returns:
-        The score, and the number of scattering events of the path.
+        The paths at their ends.
     """
-    path = start_branch(estimators, sampler, collision, score, "later")
-    hit = make_collision(estimators.media, collision.ray, collision.t, collision.body, collision.on)
-    path = _walk_to_end(estimators, _scatter(estimators, path, PathEvent.from_collision(hit, sampler.next_1d())))
-    return _add_reservoirs(estimators, path).score, path.depth
+    return _add_reservoirs(estimators, _walk_from_collision(estimators, path, collision, stops))
+
+
+def start_stem(estimators: Estimators, sampler: SpreadSampler, ray: Ray, score: Primal | Replay, *probes: str) -> Path:
+    """A path that leaves the camera (see :func:`_start_reservoirs` for ``probes``)."""
+    path = start_path(estimators, clip_camera_ray(ray), score, sampler, dr.full(mi.Bool, True, dr.width(ray)))
+    path = find_first_collision(estimators, leave_camera(estimators, path, estimators.media.medium_at(ray)))
+    return _start_reservoirs(estimators, path, *probes)
 
 
 def start_branch(estimators: Estimators, sampler: SpreadSampler, collision: FirstCollision, score: Score, *probes: str) -> Path:
@@ -349,28 +357,46 @@ def start_branch(estimators: Estimators, sampler: SpreadSampler, collision: Firs
     return _sample_first_emitter(estimators, _start_reservoirs(estimators, path, *probes))
 
 
-def advance_path(estimators: Estimators, path: Path) -> Path:
-    """Follow a path along its next segment and across the event at its end."""
-    path, event = _follow_segment(estimators, path)
-    path = _add_emitted_light(estimators, path, event)
-    return _scatter(estimators, path, event)
+def advance_path(estimators: Estimators, path: Path, collision: Collision | None = None, stops: mi.Bool | None = None) -> Path:
+    """Follow a path along its next segment and across the event at its end.
 
-
-def advance_branch(estimators: Estimators, path: Path, start: KnownFlight) -> Path:
-    """Advance a path; lanes of ``start`` are at a collision on the segment already, and scatter there."""
+    Args:
+        estimators: estimators of the render.
+        path: the path.
+        collision: lanes that are at a collision on their segment already, and scatter there; None for no lanes.
+        stops: lanes whose paths end at a collision with a medium; None for no lanes.
+    """
     active = path.active
-    path.active = active & ~start.on
+    if collision is not None:
+        path.active = active & ~collision.on
     path, event = _follow_segment(estimators, path)
     path = _add_emitted_light(estimators, path, event)
     path.active = active
-    hit = make_collision(estimators.media, path.ray, start.t, start.body, active & start.on)
-    return _scatter(estimators, path, event.begin_at(hit))
+    if stops is not None:
+        event = event.omit_collisions(stops)
+    if collision is not None:
+        event = event.begin_at(replace(collision, on=active & collision.on))
+    return _scatter(estimators, path, event)
 
 
 def _walk_to_end(estimators: Estimators, path: Path) -> Path:
     return dr.while_loop(
         state=(path,), cond=lambda path: path.active, body=lambda path: (advance_path(estimators, path),), label="path"
     )[0]
+
+
+def _walk_from_collision(estimators: Estimators, path: Path, collision: Collision, stops: mi.Bool | None = None) -> Path:
+    """Walk paths to their ends. Where ``collision`` is on, they begin at this collision (``stops``: :func:`advance_path`).
+
+    The loop scatters at the first collision too: an event in front of the loop would be compiled a second time.
+    """
+
+    def advance(path: Path, begins: mi.Bool) -> tuple[Path, mi.Bool]:
+        path = advance_path(estimators, path, replace(collision, on=collision.on & begins), stops)
+        return path, dr.full(mi.Bool, False, dr.width(begins))
+
+    state = (path, dr.full(mi.Bool, True, dr.width(collision.on)))
+    return dr.while_loop(state=state, cond=lambda path, begins: path.active, body=advance, label="path")[0]
 
 
 # -- One segment and its event -------------------------------------------------------------------------------------------
@@ -656,9 +682,23 @@ def _add_reservoirs(estimators: Estimators, path: Path) -> Path:
     if path.shadow is not None:
         path.score = path.score.add(ShadowTerm(estimators.media, path.shadow))
     if path.probes is not None:
-        for probe in (path.probes.first, path.probes.later):
-            if probe is not None:
-                path.score = path.score.add(_estimate_probe(estimators, probe, path.sampler))
+        path = _add_probes(estimators, path)
+    return path
+
+
+def _add_probes(estimators: Estimators, path: Path) -> Path:
+    """Add the derivatives at the kept points."""
+    first, later = path.probes.first, path.probes.later
+    if first is None or later is None:
+        path.score = path.score.add(_estimate_probe(estimators, first or later, path.sampler))
+        return path
+
+    def turn(number: mi.UInt32, score: Score, sampler: mi.Sampler | SpreadSampler) -> tuple:
+        probe = dr.select(number == 0, first, later)
+        return number + 1, score.add(_estimate_probe(estimators, probe, sampler)), sampler
+
+    state = dr.zeros(mi.UInt32, dr.width(first.t)), path.score, path.sampler
+    _, path.score, path.sampler = dr.while_loop(state=state, cond=lambda number, *_: number < 2, body=turn, label="probes")
     return path
 
 
@@ -670,6 +710,7 @@ def _estimate_probe(estimators: Estimators, probe: Probe, sampler: mi.Sampler) -
     mei.medium = media.medium_of(probe.body, on)
     path = start_path(estimators, probe.ray, Primal(dr.zeros(mi.Spectrum, n)), sampler, on)
     path.depth = mi.UInt32(probe.depth)
+    # The term of the probe multiplies by the albedo.
     collision = Collision(mei, point_along(probe.ray, probe.t), dr.full(mi.Spectrum, 1, n), on, probe.t, probe.body)
-    path = _walk_to_end(estimators, _scatter(estimators, path, PathEvent.from_collision(collision)))
+    path = _walk_from_collision(estimators, path, collision)
     return ProbeTerm(media, probe, mei, dr.detach(path.score.L), estimators.segment.baseline, on)
