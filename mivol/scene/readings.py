@@ -197,8 +197,10 @@ def _check_look_up(part: ExactExtinction, survey: SceneSurvey, name: str) -> Non
     cell, frac, _ = locate_cell(lattice, it.p, mi.Vector3f(0, 0, 1), mi.Float(0))
     values = [NodeArray(dr.detach(lattice.values.array), lattice.channels)]
     corners, c = read_nodes(values, corner_nodes(cell, lattice, mi.Bool(True)), mi.Bool(True))[0], lattice.channels
-    expected = np.array([np.array(interpolate(row, frac)) for row in corners])
-    actual = np.array(volume.eval_1(it))[None] if c == 1 else np.array(volume.eval(it))
+    expected, actual = [interpolate(row, frac) for row in corners], volume.eval_1(it) if c == 1 else volume.eval(it)
+    # One kernel: each conversion to NumPy would be a kernel of its own.
+    dr.eval(expected, actual, corners)
+    expected, actual = np.array([np.array(row) for row in expected]), np.array(actual).reshape(c, -1)
     spread = np.ptp(np.array([[np.array(v) for v in row] for row in corners]), axis=1)
     error, scale = np.abs(expected - actual), float(np.abs(expected).max())
     groups = [*(border[axis[border] == a] for a in range(3)), slice(len(border), None)]
