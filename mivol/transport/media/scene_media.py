@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from functools import cached_property
 
 import drjit as dr
@@ -23,7 +24,7 @@ from mivol.phase.closed_forms import INV_FOUR_PI, angle_between, eval_hg, sample
 from mivol.transport.media.body import Body, is_followed
 from mivol.transport.media.channels import to_scene_channels
 from mivol.transport.traversal.box import opaque_numbers, opaque_rows
-from mivol.transport.traversal.rays import spawn_ray
+from mivol.transport.traversal.rays import Ray, spawn_ray, to_mitsuba_ray
 
 __all__ = ["SceneMedia", "ScenePhases"]
 
@@ -68,9 +69,22 @@ class SceneMedia:
         self.start, self.locates_camera = start, locates_camera
         self.size = mi.Float(opaque_numbers(np.array([size], np.float64))[0])
         self.stops_rays = stops_rays
+        self.has_solid_surfaces = has_surfaces and stops_rays and tracer is not None and not self.traced
         self.surface_boxes = surface_boxes and [
             [[mi.Float(v) for v in row] for row in opaque_rows(rows)] for rows in surface_boxes
         ]
+
+    @cached_property
+    def alone(self) -> SceneMedia:
+        """The media without the surfaces."""
+        media = copy(self)
+        media.has_surfaces = media.traces = False
+        return media
+
+    def find_blocked(self, ray: Ray, active: mi.Bool) -> mi.Bool:
+        """Find the rays that meet a surface, if ``has_solid_surfaces``."""
+        traced = to_mitsuba_ray(ray)
+        return self.tracer.ray_test(traced, active & self.may_meet_surface(traced, traced.maxt))
 
     @cached_property
     def phases(self) -> ScenePhases:

@@ -9,6 +9,8 @@ References: Arvo & Kirk 1990 (Russian roulette).
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 
@@ -153,6 +155,10 @@ def trace_shadow_ray(
     away = direct.p - mi.Point3f(start)
     length = dr.norm(away)
     ray = FineRay.from_point(start, dr.normalize(away), direct, length)
-    stop, tau, passages, light = find_transmittance(media, ray, medium, active, rng)
-    clear = ~(stop.si.is_valid() & (stop.t < length * OWN_SURFACE))
+    if media.has_solid_surfaces:
+        clear = ~media.find_blocked(replace(ray, maxt=length * OWN_SURFACE), active)
+        _, tau, passages, light = find_transmittance(media.alone, ray, medium, active & clear, rng)
+    else:
+        stop, tau, passages, light = find_transmittance(media, ray, medium, active, rng)
+        clear = ~(stop.si.is_valid() & (stop.t < length * OWN_SURFACE))
     return RaySegment(ray, medium, length, True, u, passages), clear, tau, light
