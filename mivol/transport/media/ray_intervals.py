@@ -278,16 +278,16 @@ def trace_boundaries(
             state = visit(state, MediumInterval(ray, t, ray.maxt, alone & (medium == mi.MediumPtr(body.view.medium)), body))
         t = dr.select(alone, ray.maxt, t)
         going &= meets
+    if dr.hint(media.has_solid_surfaces, mode="scalar"):
+        hit, t_hit, medium, _ = _find_surface(media, ray, onward, medium, t, going)
+        return SegmentEnd(dr.select(going, hit, si), dr.select(going, t_hit, t), medium, 1.0), state
     null_transmission = dr.full(mi.Spectrum, 1, dr.width(ray)) if passes_null else 1.0
 
     while dr.hint(going, label="to the next opaque surface"):
-        hit = media.tracer.ray_intersect(onward, mi.RayFlags.All, False, going)
+        hit, t_hit, medium, transition = _find_surface(media, ray, onward, medium, t, going)
         is_hit = going & hit.is_valid()
-        t_hit = dr.select(is_hit, dr.maximum(t, hit_distance(ray, hit)), ray.maxt)
 
         # -- The medium on this side of the surface fills the interval --------------------------------------------------------
-        transition = is_hit & hit.is_medium_transition()
-        medium = dr.select(transition, hit.target_medium(-ray.d), medium)
         for body in media.traced:
             on = going & (medium == mi.MediumPtr(body.view.medium))
             state = visit(state, MediumInterval(ray, t, t_hit, on, body))
@@ -309,6 +309,22 @@ def trace_boundaries(
         if dr.hint(reach is not None, mode="scalar"):
             going &= mi.Float64(t_hit) < reach(state)
     return SegmentEnd(si, t, medium, null_transmission), state
+
+
+def _find_surface(
+    media: SceneMedia, ray: Ray, onward: mi.Ray3f, medium: mi.MediumPtr, t: mi.Float, active: mi.Bool
+) -> tuple[mi.SurfaceInteraction3f, mi.Float, mi.MediumPtr, mi.Bool]:
+    """Find the next surface along ``onward``, which begins at the distance ``t`` on ``ray``.
+
+    Returns:
+        The surface, its distance on ``ray`` (``ray.maxt`` without a surface), the medium in front of the surface, and lanes in
+        which the surface is the boundary of a medium.
+    """
+    hit = media.tracer.ray_intersect(onward, mi.RayFlags.All, False, active)
+    is_hit = active & hit.is_valid()
+    transition = is_hit & hit.is_medium_transition()
+    medium = dr.select(transition, hit.target_medium(-ray.d), medium)
+    return hit, dr.select(is_hit, dr.maximum(t, hit_distance(ray, hit)), ray.maxt), medium, transition
 
 
 def is_transparent(si: mi.SurfaceInteraction3f) -> mi.Bool:
