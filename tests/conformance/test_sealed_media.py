@@ -89,17 +89,27 @@ def test_a_traced_boundary_without_glass_is_passed() -> None:
     assert not survey_scene(mi.load_dict({"type": "scene", "can": can, "sky": scenes.sky()})).facts.stops_rays
 
 
-def test_what_is_not_traced_again_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+SOLID = {
+    "stops_rays": {"tank": tank(GLASS), "spoon": ball(-0.5)},
+    "has_solid_surfaces": {"tank": tank(NONE), "spoon": ball(-0.5), "table": ball(-2.5, 1.3)},
+}
+"""By what tells that rays end at surfaces, scenes in which they do."""
+
+
+@pytest.mark.parametrize("fact", SOLID)
+def test_what_is_not_traced_again_is_the_same(fact: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A lamp in a tank with a grid, images and derivatives: to the rounding of the length of a segment."""
     smoke = scenes.grid_volume("mivol_voxels", rough_grid(1, 3.0), PLACE)
-    water = {"type": "mivol_medium", "sigma_t": smoke, "albedo": 0.8}
-    bulb = {"type": "point", "position": [0.3, 0.2, 0.1], "intensity": 3.0}
-    parts = {"tank": tank(GLASS) | {"interior": water}, "bulb": bulb, "spoon": ball(-0.5)}
+    parts = SOLID[fact] | {"bulb": {"type": "point", "position": [0.3, 0.2, 0.1], "intensity": 3.0}}
+    parts["tank"] |= {"interior": {"type": "mivol_medium", "sigma_t": smoke, "albedo": 0.8}}
     eye = scenes.camera((2.0, 1.5, 6.0), (0.0, 0.0, 0.0), res=6)
-    key, found = "tank.interior_medium.sigma_t.data", []
+    key, found, seen = "tank.interior_medium.sigma_t.data", [], []
+    known = SceneMedia.__init__
+    monkeypatch.setattr(SceneMedia, "__init__", lambda self, *a, **k: known(self, *a, **k) or seen.append(getattr(self, fact)))
     for again in (False, True):
         if again:
-            monkeypatch.setattr(SceneMedia, "stops_rays", property(lambda self: False, lambda self, value: None), raising=False)
+            assert seen and all(seen)
+            monkeypatch.setattr(SceneMedia, fact, property(lambda self: False, lambda self, value: None), raising=False)
         scene = mi.load_dict({"type": "scene", **parts, "sensor": eye})
         params = mi.traverse(scene)
         dr.enable_grad(params[key])
