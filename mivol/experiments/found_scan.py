@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -109,7 +110,13 @@ def draft_scan(path: Path, changes: Sequence[str] = ()) -> ScanDraft:
     draft = SCAN_KINDS[kind or HDF5][1](path, given)
     name = path.resolve().stem
     raw = _merge({"title": name, "output": f"runs/{name}"} | draft.raw, given)
-    return ScanDraft(raw, draft.lines)
+    return ScanDraft(raw, tuple(line for line in draft.lines if not _is_replaced(line, given)))
+
+
+def _is_replaced(line: str, given: dict[str, Any]) -> bool:
+    """Whether a line tells an assumption, and changes set all settings that it names."""
+    named = re.findall(r"\b(scan|data)\.(\w+)", line) if line.startswith("assumed: ") else []
+    return bool(named) and all(key in given.get(table, {}) for table, key in named)
 
 
 def _merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
@@ -170,7 +177,8 @@ def _draft_beam(
     """
     if pitch is None:
         return [
-            "assumed: a parallel beam, and pixels of edge 1, since the files tell neither; scan.beam and scan.pitch set them"
+            "assumed: a parallel beam, since the files have no distances; scan.beam sets it",
+            "assumed: pixels of edge 1, since the files have no size of a pixel; scan.pitch sets it",
         ]
     scan["pitch"] = pitch[1] if pitch[0] == pitch[1] else list(pitch)
     lines = [f"found: pixels of {pitch[0]:.6g} x {pitch[1]:.6g} mm (rows, columns)"]
@@ -510,7 +518,7 @@ def guess_reading(path: Path, view: np.ndarray) -> tuple[dict[str, Any], str]:
         f"no flats, and edges with a median of {air:.4g}",
         "flats (light without sample), transmissions near 1 or line integrals near 0 at the edges, or edges that are equally "
         "bright, and brighter than the middle",
-        "put flats beside the views, with flat in their names",
+        "put flats beside the views, with flat in their names, or set data.reading, and data.light for an intensity",
     )
 
 

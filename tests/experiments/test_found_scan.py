@@ -143,6 +143,15 @@ def test_a_scanner_s_file_is_named(tmp_path: Path) -> None:
     assert not found_scan.has_scan_files(folder)
 
 
+def test_assumptions_that_changes_replace_are_not_told(tmp_path: Path) -> None:
+    folder = write_tiffs(tmp_path / "scan")
+    names = ("scan.beam", "scan.pitch", "scan.arc", "data.first_row")
+    told = [[name for name in names if any(name in line for line in draft_scan(folder, changes).lines)] for changes in (
+        [], ["scan.pitch=2", "scan.arc=360"], ["data.first_row=lowest", 'scan={beam="cone", source_to_axis=1}'],
+    )]  # fmt: skip
+    assert told == [list(names), ["scan.beam", "data.first_row"], ["scan.pitch", "scan.arc"]]
+
+
 def test_a_file_of_pages_is_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """Flats and darks beside it count if their images are as large; explain takes it for a volume without --set."""
     tifffile = pytest.importorskip("tifffile")
