@@ -108,6 +108,10 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
         ``rest``.
     """
     known = parser()
+    if words[:1] == ["bench"] and {"-h", "--help"} & set(words[2:]):
+        from mivol.bench.harness.catalogue import load_study
+
+        load_study(words[1]).parse(["--help"])  # ends the process
     arguments, rest = known.parse_known_args(words)
     arguments.rest = rest
     if rest and arguments.verb is not bench:
@@ -475,7 +479,7 @@ VERBS: dict[str, Verb] = {
             flag("--quick", action="store_true", help="run small work that tests the study; its times mean nothing"),
             flag("--compare", type=Path, metavar="old.json", help="print the changes since an earlier result"),
         ],
-        lambda: "A study has more flags of its own: --only, --out, --variant, ...",
+        lambda: "A study has more flags of its own (mivol bench STUDY --help): --only, --out, --variant, ...",
     ),
     "doctor": Verb(doctor),
 }

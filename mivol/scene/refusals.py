@@ -146,7 +146,7 @@ def check_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> No
         (bool(moved), f"the derivative of {', '.join(moved)} was requested", "use finite differences"),
     ]
     kind = f"is a {medium.bounded}, which is bounded (a majorant is known, and no optical depth of a ray)"
-    _raise_first(f"the medium in {medium.name} {kind}", reasons, "voxelise the field")
+    _raise_first(f"the medium in {medium.name} {kind}", reasons, "voxelise the field (nodes of a mivol_hash)")
 
 
 def check_gaussians(needs: Needs, aovs: tuple[str, ...]) -> None:

@@ -201,6 +201,9 @@ def test_every_verb_says_what_it_does(capsys: pytest.CaptureFixture) -> None:
             run(verb, "--help")
         assert done.value.code == 0
         assert VERBS[verb].summary in capsys.readouterr().out.replace("\n", " ").replace("  ", " ")
+    with pytest.raises(SystemExit) as done:
+        run("bench", "representations", "--help")
+    assert done.value.code == 0 and "--fox-edge" in capsys.readouterr().out
 
 
 def test_wrong_arguments_end_with_2(capsys: pytest.CaptureFixture) -> None:
