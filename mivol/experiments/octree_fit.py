@@ -133,7 +133,7 @@ class OctreeFit(FieldFit):
         self.network = read_start(path, self.photos.space, self.photos.white)
         self.add_stage(run, self.network.noun, self.network, path)
         cells = np.array(self.network.region.occupied)
-        count, size = f"{int(cells.sum())} of {len(cells)} cells", f"{len(cells) / 8 / 2**20:.2f}"
+        count, size = f"{int(cells.sum())} of {len(cells)} cells", f"{len(cells) / 8 / 2**20:.3g}"
         self.stage_rows.append(("its occupied cells", count, "-", "-", size, f"{self.clock:.0f}"))
 
     def make_problem(self) -> OctreeProblem:
