@@ -109,9 +109,9 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     """
     known = parser()
     if words[:1] == ["bench"] and {"-h", "--help"} & set(words[2:]):
-        from mivol.bench.harness.catalogue import load_study
+        from mivol.bench.harness.catalogue import run_study
 
-        load_study(words[1]).parse(["--help"])  # ends the process
+        run_study(words[1], ["--help"], None)  # ends the process
     arguments, rest = known.parse_known_args(words)
     arguments.rest = rest
     if rest and arguments.verb is not bench:
