@@ -31,7 +31,7 @@ from mivol.files.mesh import Atlas, Mesh, write_mesh
 from mivol.photos.camera_path import HomeView
 from mivol.points import Gaussians, read_gaussians, write_gaussians
 from mivol.points.gaussian_gltf import turn
-from mivol.points.sog import FEWER, fit_palette, fit_table, morton_order
+from mivol.points.sog import fit_palette, fit_table, morton_order
 from mivol.splatting import Splatter, to_tensors
 
 SUFFIXES = (".spz", ".splat", ".ksplat", ".sog", ".glb")
@@ -203,12 +203,17 @@ def test_a_table_is_as_fine_as_even_steps() -> None:
     assert (np.diff(table) >= 0).all() and ((table[codes] - values) ** 2).mean() < (np.ptp(values) / 127) ** 2 / 12
 
 
-def test_large_sets_of_harmonics_share_a_palette() -> None:
-    """Points of 10 clusters, far more than the palette holds: each is as near as its cluster is wide."""
+def test_large_sets_of_harmonics_share_a_palette(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Points of 10 clusters, far more than the palette holds: each is as near as its cluster is wide. One point more than the most
+    that are kept as they are makes the palette."""
+    monkeypatch.setattr("mivol.points.sog.MOST", 5000)
+    monkeypatch.setattr("mivol.points.sog.FEWER", 100)
     rng = np.random.default_rng(0)
-    rows = np.float32(rng.integers(0, 10, 66_000)[:, None] * 10 + rng.normal(0, 0.1, (66_000, 3)))
+    rows = np.float32(rng.integers(0, 10, 5001)[:, None] * 10 + rng.normal(0, 0.1, (5001, 3)))
     palette, numbers = fit_palette(rows)
-    assert len(palette) == FEWER and np.abs(palette[numbers] - rows).max() < 1
+    assert len(palette) == 100 and np.abs(palette[numbers] - rows).max() < 1
+    palette, numbers = fit_palette(rows[:-1])
+    assert np.array_equal(palette[numbers], rows[:-1])
 
 
 def test_neighbours_on_the_curve_are_neighbours_in_space() -> None:
