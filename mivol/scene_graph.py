@@ -23,7 +23,13 @@ def traverse(node: mi.Object) -> mi.SceneParameters:
 
 def list_values(params: mi.SceneParameters) -> list[tuple[str, Any]]:
     """The keys and values of parameters: the pairs of ``list(params)``."""
-    return [(key, params[key]) for key in params.keys()]  # noqa: SIM118  (iteration gives pairs, and defines a class)
+    return [(key, read_value(params, key)) for key in params.properties]
+
+
+def read_value(params: mi.SceneParameters, key: str) -> Any:
+    """The value of a parameter. ``params[key]`` also notes its arrays, for an update after a change in place."""
+    value, kind, node, _ = params.properties[key]
+    return value if kind is None else mi.get_property(value, kind, node)
 
 
 def put_value(params: mi.SceneParameters, key: str, value: Any) -> None:

@@ -7,7 +7,7 @@ recording reads the arrays of that call.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import drjit as dr
@@ -86,7 +86,7 @@ class PlannedScene:
         """Whether a scene in this state, with so many samples, has the same facts."""
         return self.spp == spp and self.state.is_same(state)
 
-    @property
+    @cached_property
     def key(self) -> tuple:
         """All that a recording depends on and does not follow."""
         return (*self.plan.decisions, self.needs.camera_inside, *self.state.key)

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.scene.stand_in import ARRAYS, FOUND_SENSOR, RECORDED_FILM, describe_kind
-from mivol.scene_graph import find_children, list_values, traverse
+from mivol.scene_graph import find_children, list_values, read_value, traverse
 from mivol.transport.path.film import find_batch_views
 
 FOLLOWED = ("data", "value")
@@ -93,8 +93,7 @@ class SceneState:
         """Add parameters; returns the keys with gradients enabled, and their owners, and appends their arrays."""
         differentiated = []
         for key in params.properties:
-            _, _, owner, _ = params.properties[key]
-            value = params[key]
+            value, owner = read_value(params, key), params.properties[key][2]
             numbers = value if dr.is_array_v(value) else getattr(value, "matrix", None)
             if numbers is None or not dr.is_jit_v(numbers):
                 self.others.append(value if isinstance(value, int | float | str | bool) else str(value))
