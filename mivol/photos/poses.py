@@ -95,7 +95,7 @@ class Poses:
             first = self.others[0][0]
             lines.append(
                 f"{sizes} photographs ({first}, ...) have poses in models of their own, which share nothing with it; "
-                f"photograph what lies between {first} and {self.posed[-1]}"
+                f"photograph what lies between {first} and {self.posed[-1]}, or put another place into a folder of its own"
             )
         apart = {name for names in self.others for name in names}
         if unposed := [name for name in self.unposed if name not in apart]:
