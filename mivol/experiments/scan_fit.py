@@ -461,5 +461,6 @@ def write_grids(folder: Path, grid: VoxelGrid, x: np.ndarray, truth: np.ndarray 
     for role, values in {"reconstruction": x, **({"truth": truth} if truth is not None else {})}.items():
         write_volume(folder / f"volumes/{role}.vol", values, grid.to_world)
         write_volume(folder / f"volumes/{role}.npz", values, grid.to_world, metadata=_name_unit(unit))
-        volumes.append(Volume(path=f"volumes/{role}.npz", role=role, size=size, profiles=True))
+        about = {"size": size, "unit": f"1/{unit or 'length'}", "profiles": True}
+        volumes.append(Volume(path=f"volumes/{role}.npz", role=role, **about))
     return volumes

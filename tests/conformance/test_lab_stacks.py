@@ -159,6 +159,7 @@ def test_a_tilt_series_becomes_a_volume(variant_rgb: str, tmp_path: Path) -> Non
     assert main(["optimize", str(tmp_path / "series.mrc"), *flags]) == 0
     volume = read_volume(tmp_path / "run/volumes/reconstruction.npz")
     assert volume.values.shape == (12, 32, 32, 1) and volume.meta["unit"] == "A"
+    assert "[1/A]" in (tmp_path / "run/report.html").read_text()
 
 
 def test_a_tilt_series_without_air_or_without_angles(tmp_path: Path, capsys) -> None:
