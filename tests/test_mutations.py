@@ -250,8 +250,18 @@ def test_rounds_have_a_time(index, monkeypatch: pytest.MonkeyPatch) -> None:
         ["tests/test_c.py::t", "tests/test_a.py::t", "tests/test_b.py::p[2]"],
         ["tests/test_b.py::u"],
         [],
+        [],
     ]
-    assert index.rounds(fault_at(13, "mivol/unknown.py"), SMALL) == [[], [], []]
+    assert index.rounds(fault_at(13, "mivol/unknown.py"), SMALL) == [[], [], [], []]
+
+
+def test_samples_judge_code_of_renders_that_tests_run(index) -> None:
+    file = "mivol/transport/a.py"
+    index.runners[file, 13] = [1]
+    assert index.rounds(fault_at(13, file), SMALL)[3] == ["-m", "slow", guards.OF_SAMPLES]
+    assert index.rounds(fault_at(13, "mivol/scene/unknown.py"), SMALL)[3] == []
+    assert (ROOT / guards.OF_SAMPLES).is_file()
+    assert all((ROOT / room).is_dir() for room in guards.SAMPLING)
 
 
 @pytest.mark.parametrize(("line", "expected"), [(3, True), (6, True), (17, True), (13, False)])

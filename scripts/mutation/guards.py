@@ -30,6 +30,13 @@ OF_IMPORTS = ("tests/test_docs.py::test_reference_is_what_the_code_says",)
 """Tests of what imports compute: default arguments, settings and tables stand on the pages of the reference."""
 
 
+OF_SAMPLES = "tests/conformance/test_drawn_pictures.py"
+"""Slow tests that compare single samples of renders. A fault that changes noise but no mean is seen by no other test."""
+
+SAMPLING = ("mivol/transport/", "mivol/scene/", "mivol/phase/", "mivol/plugins/")
+"""Where code of renders stands."""
+
+
 @dataclass(frozen=True)
 class RunTest:
     """A test of the recording.
@@ -94,7 +101,8 @@ class Guards:
            line that an import runs;
         2. more tests that run its line, ``SECOND`` seconds of them;
         3. if slow tests count, those in files called like the module. If no recorded test runs the line, all tests of these
-           files, because the recording sees no other processes.
+           files, because the recording sees no other processes;
+        4. ``OF_SAMPLES`` for code of renders that a recorded test runs.
         """
         runners = self.find_runners(fault, source)
         first, rest = split_by_time(runners, FIRST)
@@ -103,7 +111,8 @@ class Guards:
         two = [test.name for test in split_by_time(rest, SECOND)[0] if test.name not in one]
         files = self.find_test_files(fault.file, is_unrun=not runners) if self.slow or not runners else []
         which = "not slow" if not self.slow else "slow" if runners else "slow or not slow"
-        return [one, two, ["-m", which, *files] if files else []]
+        samples = ["-m", "slow", OF_SAMPLES] if runners and fault.file.startswith(SAMPLING) else []
+        return [one, two, ["-m", which, *files] if files else [], samples]
 
     def find_test_files(self, file: str, is_unrun: bool) -> list[str]:
         """Files with slow tests that are called like a module; for an unrun line any such file, or those that import it."""
