@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mivol.experiments.script import explain
+from mivol.scene.explain import choose_recording
 from scenes import ball_of, box_of, camera, centred, grid_volume, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -66,3 +67,12 @@ def test_a_surface_in_a_medium_does_not_hide_it():
     assert "opaque" not in explain(mi.load_dict({"type": "scene", **parts}))
     parts["stone"] = {"type": "sphere", "radius": 0.2, "interior": medium("homogeneous", 0.7)}
     assert "the medium of stone lies behind an opaque" in explain(mi.load_dict({"type": "scene", **parts}))
+
+
+@pytest.mark.parametrize(("for_images", "subject"), [(True, "images"), (False, "gradients")])
+def test_what_is_not_recorded_is_traced_with_its_reason(monkeypatch: pytest.MonkeyPatch, for_images: bool, subject: str):
+    for unrecorded, choice in ((None, "recorded in the first call"), ("a GPU", "traced in every call")):
+        monkeypatch.setattr("mivol.scene.explain.find_unrecorded", lambda *_, found=unrecorded: found)
+        found = choose_recording(None, None, None, None, for_images)
+        assert found.subject == subject and found.choice.startswith(choice)
+        assert found.reason == (unrecorded or "a recording follows values, cameras and seeds that change between calls")
