@@ -204,8 +204,8 @@ def test_a_table_is_as_fine_as_even_steps() -> None:
 
 
 def test_large_sets_of_harmonics_share_a_palette(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Points of 10 clusters, far more than the palette holds: each is as near as its cluster is wide. One point more than the most
-    that are kept as they are makes the palette."""
+    """Points of 10 clusters, far more than the palette holds: each is as near as its cluster is wide. The most points that are
+    kept as they are, and one more, which makes the palette."""
     monkeypatch.setattr("mivol.points.sog.MOST", 5000)
     monkeypatch.setattr("mivol.points.sog.FEWER", 100)
     rng = np.random.default_rng(0)
