@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.scene.description import NOT_UTF8, content_hash, describe_error
+from mivol.scene.description import NOT_UTF8, _printed_settings, content_hash, describe_error
 from mivol.scene.load import load_scene
 from mivol.threads import run_child
 
@@ -253,3 +253,9 @@ def test_what_cannot_be_hashed_says_so(variant_rgb):
     box = mi.ScalarBoundingBox3f([0, 0, 0], [1, 1, 1])
     with pytest.raises(MivolError, match='"note" of the scene is a (Scalar)?BoundingBox3f'):
         content_hash({"type": "scene", "s": {"type": "sphere", "note": box}})
+
+
+def test_what_stands_behind_a_sampler_is_kept():
+    """A sampler, an integrator and addresses change from run to run; brackets inside of them do not end them."""
+    text = "Camera[ sampler = IndependentSampler[ seeds = [1, [2]], n = 3 ], film = Film[ 0x7f3a, object_12 ], fov = 40 ]"
+    assert _printed_settings(text) == "Camera[ sampler = , film = Film[ ,  ], fov = 40 ]"

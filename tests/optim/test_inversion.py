@@ -38,7 +38,7 @@ def test_problem_stores_the_volume(scan):
 
 @pytest.mark.parametrize("name", ["pcg", "os-sart"])
 def test_steps_match_the_solver(scan, name):
-    """And a run that goes on from what was stored takes the same ones; each begins at a safe point."""
+    """And a run that goes on from what was stored takes the same ones, also before the first; each begins at a safe point."""
     safe = []
     problem = inversion(scan, safe_point=lambda: safe.append(1))
     settings = LinearSolve(solver=name, subsets=6)
@@ -46,6 +46,7 @@ def test_steps_match_the_solver(scan, name):
     expected = run(name, problem.linear_problem, 4, **options)
     first = settings.begin(problem)
     assert first.pack() == {}
+    first.unpack(first.pack())
     assert [first.step(k, 1.0) for k in range(2)] == [s.objective for s in expected[:2]]
     second = settings.begin(problem)
     second.unpack(first.pack())
