@@ -323,6 +323,16 @@ def test_what_is_left_out_is_named(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "conductor" not in said  # the material of an object ends with it
 
 
+@pytest.mark.parametrize(("names", "outside"), [('"m" ""', ""), ('"m" "n"', "n"), ('"m"', "m")])
+def test_a_medium_outside_of_a_shape_is_named(tmp_path: Path, capsys: pytest.CaptureFixture, names: str, outside: str) -> None:
+    """One name is the medium on both sides."""
+    medium = 'MakeNamedMedium "m" "string type" "homogeneous"'
+    text = f'Camera "perspective" Film "rgb" WorldBegin {medium} MediumInterface {names} Shape "sphere"'
+    (tmp_path / "a.pbrt").write_text(text)
+    assert main(["convert", str(tmp_path / "a.pbrt"), str(tmp_path / "a.xml")]) == 0
+    assert re.findall(r"the medium '(\w*)' outside of a shape", capsys.readouterr().out) == [outside] * bool(outside)
+
+
 PATCH = [[0, 0, 2], [1, 0, 2], [0, 3, 2], [2, 3, 2]]
 """Corners of a bilinear patch: along its first axis, then along its second."""
 
