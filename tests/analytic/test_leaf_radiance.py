@@ -197,6 +197,7 @@ def test_codes_are_separated_and_interleaved() -> None:
         ({"density": np.array([1, -2])}, "extinction of -2"),
         ({"sh": np.zeros((2, 2, 3))}, "2 harmonics"),
         ({"sizes": np.array([1, 1, 1], np.uint8)}, "3 sizes"),
+        ({"sizes": np.array([4, 0], np.uint8)}, r"a leaf of size 2\^4"),
         ({"codes": np.zeros(0, np.uint64)}, "0 leaves"),
         ({"colours": "relu"}, "'relu'"),
     ],
