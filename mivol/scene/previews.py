@@ -15,12 +15,12 @@ and with d - 1: the difference is the light that scatters d - 1 times. One kerne
 
 **Light of media.** The prediction of :mod:`mivol.scene.media_light` considers only the light of media. If other light is
 noisier, sampling costs time and removes hardly any noise. So :func:`measure_media_light` renders cells of the film with and
-without sampling, along one ray per cell. The gain is a ratio of sums over the cells,
+without sampling, along one ray per cell. The gain is the median over the cells of
 
-.. math:: g = \frac{\max\left( \sum s_{met}^2,\; \sum n\,(m_{met} - m_{drawn})^2 - s_{drawn}^2 \right)}{c\,\sum s_{drawn}^2}
+.. math:: g = \frac{\max( s_{met}^2,\; n\,(m_{met} - m_{drawn})^2 )}{c\,s_{drawn}^2}
 
-with the means m and variances s^2 of n samples, and c the time of a path with sampling over the time of a path without. Both
-sums of the numerator have the same mean. If no path hits a light found by sampling, the second one has the unseen noise.
+with the means m and variances s^2 of n samples, and c the time of a path with sampling over the time of a path without. If no
+path hits a light found by sampling, the difference of the means stands for the unseen noise.
 
 **Light of near emitters.** :func:`measure_near_light` renders the same cells with direct light at collisions and at distances
 drawn on each segment. The gain is the sum of the variances of all cells with collisions, over c times their sum with distances:
@@ -512,15 +512,14 @@ def _middle_pixels(sensor: mi.Sensor, side: int) -> tuple[Callable[[mi.UInt32], 
 
 
 def sampling_gain(met: NDArray, drawn: NDArray) -> float:
-    """Gain in time to an error of sampling over chance [1], from samples (cells, n) of both; 0 for black cells.
-
-    Sums and not a median over the cells: most of the noise of chance hits is in few pixels, which are bright by one hit.
-    """
+    """Gain in time to an error of sampling over chance [1], from samples (cells, n) of both; 0 for black cells."""
     n = met.shape[1]
-    rest = drawn.var(axis=1, ddof=1).sum()
-    missed = n * np.square(met.mean(axis=1) - drawn.mean(axis=1)).sum() - rest
-    noise = max(met.var(axis=1, ddof=1).sum(), missed)
-    return float(noise / (SAMPLING_COST * rest)) if rest > 0 else math.inf if noise > 0 else 0.0
+    missed = n * np.square(met.mean(axis=1) - drawn.mean(axis=1))
+    noise = np.maximum(met.var(axis=1, ddof=1), missed)
+    rest = SAMPLING_COST * drawn.var(axis=1, ddof=1)
+    lit = (noise > 0) | (rest > 0)
+    with np.errstate(divide="ignore"):
+        return float(np.median(noise[lit] / rest[lit])) if lit.any() else 0.0
 
 
 def _render_draw_preview(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> NDArray:

@@ -149,15 +149,13 @@ def test_what_draws_gain() -> None:
 
 
 def test_the_gain_is_of_variances_or_of_what_chance_has_missed() -> None:
-    """Cells of variances 4 and 1, and a cell in which chance finds nothing of a light of 1: 16 samples of it weigh 16, less the
-    variance of .25 of its samples.
-    """
+    """Cells of variances 4 and 1, and a cell in which chance finds nothing of a light of 1: 16 samples of it weigh 16."""
     swing = np.tile([-1.0, 1.0], 8) * np.sqrt(15 / 16)
     drawn_cells = np.stack([5 + swing, 5 + swing, 1 + 0.5 * swing])
     assert sampling_gain(5 + 2 * swing[None], drawn_cells[:1]) == pytest.approx(4 / SAMPLING_COST)
-    assert sampling_gain(0 * swing[None], drawn_cells[2:]) == pytest.approx((16 - 0.25) / 0.25 / SAMPLING_COST)
-    several = sampling_gain(np.stack([5 + 2 * swing, 5 + 3 * swing, 0 * swing]), drawn_cells)
-    assert several == pytest.approx((16 - 2.25) / 2.25 / SAMPLING_COST)
+    assert sampling_gain(0 * swing[None], drawn_cells[2:]) == pytest.approx(16 / 0.25 / SAMPLING_COST)
+    median = sampling_gain(np.stack([5 + 2 * swing, 5 + 3 * swing, 0 * swing]), drawn_cells)
+    assert median == pytest.approx(9 / SAMPLING_COST)
     assert sampling_gain(np.zeros((2, 4)), np.zeros((2, 4))) == 0.0
 
 
