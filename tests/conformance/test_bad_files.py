@@ -376,8 +376,7 @@ def test_bad_slices(tmp_path: Path) -> None:
 
 EXCHANGE: dict[str, tuple[dict, tuple[str, ...]]] = {
     "no data": ({"data": None}, ("no dataset exchange/data", "data_dark, data_white, theta")),
-    "no flats": ({"data_white": None}, ("no dataset exchange/data_white",)),
-    "no angles": ({"theta": None}, ("no dataset exchange/theta",)),
+    "no flats": ({"data_white": None}, ("no flat (light without sample)", "data.flats")),
     "angles": ({"theta": np.arange(3.0)}, ("3 angles", "4, one per view")),
     "angle NaN": ({"theta": np.array([0, 1, np.nan, 2])}, ("nan in theta at (2,)",)),
     "flats of another size": ({"data_white": np.ones((1, 2, 4))}, ("data_white of 2 x 4", "2 x 3")),
