@@ -140,9 +140,7 @@ class Steps:
         times: of all steps.
     """
 
-    def __init__(
-        self, pool: Pool, make: Callable[[Workplace, Any], Twin], content: Any, needs: Sequence[str] = ()
-    ) -> None:
+    def __init__(self, pool: Pool, make: Callable[[Workplace, Any], Twin], content: Any, needs: Sequence[str] = ()) -> None:
         """Register a twin as an input of work.
 
         Args:

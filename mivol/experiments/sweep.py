@@ -143,9 +143,7 @@ def _parse_value(word: str) -> Any:
         return word
 
 
-def plan_sweep(
-    path: Path, over: Sequence[str], changes: Sequence[str], folder: Path | None = None, command: str = ""
-) -> Sweep:
+def plan_sweep(path: Path, over: Sequence[str], changes: Sequence[str], folder: Path | None = None, command: str = "") -> Sweep:
     """Make and check the settings of all runs.
 
     Args:

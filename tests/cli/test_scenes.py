@@ -270,7 +270,8 @@ def test_tank_in_glass(tmp_path, glass, variant_rgb):
 @pytest.mark.slow
 def test_what_is_said_of_the_tank_in_glass(tmp_path, script):
     """All coefficients of all channels beside the published, a warning where steps have not settled, and the figure."""
-    tiny = ("--size", 8, "--spp", 4, "--photo-spp", 64, "--rounds", 2, "--iterations", 1, "--dilutions", 0.1)
+    # Fewer samples may leave a coefficient without a derivative: blue light hardly leaves the juice.
+    tiny = ("--size", 8, "--spp", 16, "--photo-spp", 64, "--rounds", 2, "--iterations", 1, "--dilutions", 0.1)
     said = script("tank", *tiny, "-o", tmp_path, file="glass.py")
     assert len(re.findall(r"^\w+ +(?:sigma_s|sigma_a|g) .* off by [\d.]+%, [\d.]+ s.e.$", said, re.MULTILINE)) == 9
     assert "not settled in 1 steps" in said

@@ -151,9 +151,7 @@ POINTS_DEPTH = 7
 """Depth of the octree of a field that is known at points, without another depth: 128 leaves along the longest edge."""
 
 
-def build_octree_of_points(
-    field: SampledField, rays: ViewRays, recipe: OctreeRecipe, degree: int = 2
-) -> Octree:
+def build_octree_of_points(field: SampledField, rays: ViewRays, recipe: OctreeRecipe, degree: int = 2) -> Octree:
     """Make an octree straight from a hash grid or a NeRF.
 
     A leaf has the mean extinction of the points in it, and the colour at its centre of mass, projected onto harmonics. Colours

@@ -316,9 +316,7 @@ def join_slopes(each: list[dict[str, mi.Float]]) -> dict[str, mi.Float]:
     return joined
 
 
-def find_region(
-    field: SampledField, cells: int, samples_a_cell: float = 2.0, rounds: int = 8, seed: int = 0
-) -> SampledField:
+def find_region(field: SampledField, cells: int, samples_a_cell: float = 2.0, rounds: int = 8, seed: int = 0) -> SampledField:
     """A field with its occupied cells, as rays and files need them: of a network that was not fitted here.
 
     Args:
