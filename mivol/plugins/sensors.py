@@ -20,20 +20,20 @@ class CopiedCamera(mi.Sensor):
         super().__init__(props)
         self.m_needs_sample_3 = props["on_lens"]
 
-    def take(
-        self, to_world: mi.Matrix4f, near: mi.Float, far: mi.Float, x_fov: mi.Float | None = None,
+    def take_lens(
+        self, near: mi.Float, far: mi.Float, x_fov: mi.Float | None = None,
         aperture_radius: mi.Float | None = None, focus_distance: mi.Float | None = None,
     ) -> None:  # fmt: skip
-        """Take the numbers of a camera, whose parameters have the same names."""
+        """Take all numbers of a camera but its place; its parameters have the same names."""
         film = self.film()
         window = film.size(), film.crop_size(), film.crop_offset()
         if x_fov is None:
             on_film = mi.orthographic_projection(*window, near, far)
         else:
             on_film = mi.perspective_projection(*window, x_fov, near, far)
-        self.to_world, self.to_camera, self.near, self.far = to_world, on_film.inverse().matrix, near, far
+        self.to_camera, self.near, self.far = on_film.inverse().matrix, near, far
         self.radius, self.focus = aperture_radius, focus_distance
-        dr.eval(self.to_world, self.to_camera)
+        dr.eval(self.to_camera)
 
     def sample_ray_differential(
         self, time: mi.Float, wavelength: mi.Float, on_film: mi.Point2f, aperture: mi.Point2f, active: mi.Bool = True

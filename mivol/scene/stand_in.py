@@ -168,15 +168,18 @@ class StandIn:
             self._copies = dict(list(self._copies.items())[1 - MAX_CAMERAS :])
             self._copies[key] = _CameraCopy.of(numbers, names, dr.detach(arrays))
         copy = self._copies[key]
-        if not self._is_found:
-            self.camera.take(copy.matrices[0], *(dr.opaque(mi.Float, number) for number in numbers[:2]), **copy.arrays)
-        else:
+        has_other_lens = copy.lens != self._lens
+        if self._is_found:
             self._params["to_world"] = type(given["to_world"])(*copy.matrices)
             # An update makes 115 launches, and waits for each of 79 numbers.
-            if copy.lens != self._lens:
+            if has_other_lens:
                 for name, value in (dict(zip(NUMBERS, numbers, strict=True)) | copy.arrays).items():
                     self._params[name] = value
                 self._params.update()
+        else:
+            self.camera.to_world = copy.matrices[0]
+            if has_other_lens:
+                self.camera.take_lens(*(dr.opaque(mi.Float, number) for number in numbers[:2]), **copy.arrays)
         self._shown, self._lens = key, copy.lens
 
     def meet(self, sensor: mi.Sensor, others: Sequence[mi.Sensor], names: list[str]) -> None:
