@@ -284,10 +284,7 @@ def measure_emission_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, sur
 
     Cost: 2 x 16384 paths once, and a kernel; if paths have less noise without this light, 16384 camera rays and another kernel.
     """
-    # A camera of several views is not measured: Mitsuba's keeps arrays that recordings do not know.
-    if sensor.class_name() == "BatchSensor" or is_recording():
-        return needs
-    if not is_emission_noise_open(needs, settings, choose_segment(needs, settings)):
+    if not _is_measurable(sensor) or not is_emission_noise_open(needs, settings, choose_segment(needs, settings)):
         return needs
     if sensor.ptr not in survey.emission_noise:
         with without_garbage_collection(), dr.suspend_grad():
@@ -395,10 +392,7 @@ def measure_branch_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, surve
 
     Cost: 65536 camera rays once, and 5 paths for each that collides.
     """
-    # A camera of several views is not measured: Mitsuba's keeps arrays that recordings do not know.
-    if sensor.class_name() == "BatchSensor" or is_recording():
-        return needs
-    if not is_branch_noise_open(needs, settings, choose_segment(needs, settings)):
+    if not _is_measurable(sensor) or not is_branch_noise_open(needs, settings, choose_segment(needs, settings)):
         return needs
     if sensor.ptr not in survey.branch_noise:
         with without_garbage_collection(), dr.suspend_grad():
@@ -406,6 +400,12 @@ def measure_branch_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, surve
             estimators = build_estimators(scene, needs, plan, settings, survey, for_images=True)
             survey.branch_noise[sensor.ptr] = _measure_branches(sensor, plan.light_of_paths(estimators))
     return replace(needs, branch_noise=survey.branch_noise[sensor.ptr])
+
+
+def _is_measurable(sensor: mi.Sensor) -> bool:
+    """Whether pixels of a sensor may be measured: not while Dr.Jit records, and not of a camera of several views, since
+    Mitsuba's keeps arrays that recordings do not know."""
+    return sensor.class_name() != "BatchSensor" and not is_recording()
 
 
 def _measure_branches(sensor: mi.Sensor, estimators: Estimators) -> BranchNoise:
