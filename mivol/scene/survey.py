@@ -197,7 +197,8 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     solid = [*surfaces, *(s for s in edges if _is_bare(s))]
     # A GPU traces rays in hardware.
     follows = mi.variant().startswith("llvm") and 0 < len(solid) <= MAX_FOLLOWED_SURFACES and not is_recording()
-    tracer = _make_tracer(solid) if follows and boxed else None
+    # Mitsuba cannot put an instance into another scene.
+    tracer = _make_tracer(solid) if follows and boxed and not any(is_instance(s) for s in solid) else None
     # Inside of a traced boundary, every ray meets its box.
     has_boxes = follows and all(b.box or b.shape == OUTSIDE_SHAPES for b in boundaries)
     pieces = tuple(rows for s in solid for rows in _surface_boxes(s)) if has_boxes else ()

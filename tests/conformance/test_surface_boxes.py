@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from scattering_scenes import PLACE, close_up, mivol, rough_grid, smoke, sun
+from scattering_scenes import PLACE, assert_same_whole, close_up, mivol, moments, rough_grid, smoke, sun
 
 from mivol.scene import session
 from mivol.scene.survey import survey_scene
@@ -63,6 +63,20 @@ def test_no_surface_is_met_outside_of_its_box(name: str) -> None:
         assert hit.any() or ray is along
         assert not np.any(hit & ~meets)
         assert ray is along or np.mean(~meets) > 1 / 3
+
+
+@pytest.mark.statistical
+def test_instances_among_the_surfaces() -> None:
+    """Mitsuba cannot put an instance into the scene of the surfaces alone; the image is that of the balls themselves."""
+    ball, places = {"type": "sphere", "radius": 0.4}, [(1.4, 0, 0.2), (-1.3, 0.3, 0.4)]
+    balls = {f"ball{k}": ball | {"center": list(place)} for k, place in enumerate(places)}
+    moves, of = [mi.ScalarTransform4f().translate(place) for place in places], {"type": "ref", "id": "kind"}
+    copies = {f"copy{k}": {"type": "instance", "of": of, "to_world": move} for k, move in enumerate(moves)}
+    parts = {"smoke": smoke(rough_grid(2))[0], "sun": sun((-0.5, 0.3, -1.0))[0]}
+    with_copies = close_up({"kind": {"type": "shapegroup", "ball": ball}, **copies, **parts}, res=12)
+    assert survey_scene(with_copies).tracer is None
+    judge = moments(close_up({**balls, **parts}, res=12), mivol(), 16, first=100)
+    assert_same_whole(moments(with_copies, mivol(), 16), judge)
 
 
 def test_an_image_does_not_depend_on_the_boxes(monkeypatch: pytest.MonkeyPatch) -> None:
