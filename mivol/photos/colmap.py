@@ -20,7 +20,7 @@ import numpy as np
 from mivol.files.source import parse_reals, read_bytes, refusal
 from mivol.photos.camera import FLIP, Camera, intrinsics
 from mivol.photos.lens import Fisheye, Lens
-from mivol.photos.listing import SHRUNK, Entry, Listing, check_points, find_image, list_photographs
+from mivol.photos.listing import SHRUNK, Entry, Listing, check_points, find_image, list_photographs, name_first
 
 MODEL_NUMBERS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
@@ -129,8 +129,8 @@ def _note_unposed(folder: Path, model: Path, posed: set[str], suffix: str) -> tu
     unposed = sorted(set(names) - posed)
     if not unposed:
         return ()
-    named = ", ".join(unposed[:5]) + (" ..." if len(unposed) > 5 else "")
-    note = f"{len(posed)} of {len(posed) + len(unposed)} photographs have a pose in {model}; without a pose: {named}"
+    counted = f"{len(posed)} of {len(posed) + len(unposed)} photographs have a pose in {model}"
+    note = f"{counted}; without a pose: {name_first(unposed)}"
     others = {other: _count_poses(other / f"images{suffix}") for other in model.parent.iterdir() if other.name.isdecimal()}
     largest = max(others, key=others.get, default=model)
     if others.get(largest, 0) > len(posed):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -115,6 +115,11 @@ def check_points(rows: np.ndarray, file: Path, way_out: str) -> None:
     if not np.isfinite(rows).all():
         number = int(np.argmin(np.isfinite(rows).all(axis=1)))
         raise refusal(file, f"point {number} at {rows[number, :3].tolist()}", "finite numbers", way_out)
+
+
+def name_first(names: Sequence[str]) -> str:
+    """Join the first five names by commas; dots stand for the rest."""
+    return ", ".join(names[:5]) + (" ..." if len(names) > 5 else "")
 
 
 def split_numbers(name: str) -> list[tuple[int, str]]:

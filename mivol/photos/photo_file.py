@@ -21,11 +21,15 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
+from mivol.errors import MivolError
 from mivol.files import decode_srgb, encode_srgb, read_exr, read_exr_header
 from mivol.files.source import check_file, refusal
 
 #: suffixes of photographs, in the order of the trials for a name without suffix.
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".webp", ".heic", ".heif", ".avif")
+
+HEIC = (".heic", ".heif")
+"""Suffixes that Pillow reads with pillow-heif alone."""
 
 #: mode of Pillow with 8 bits per channel -> mode after reading.
 MODES = {"1": "RGB", "L": "RGB", "LA": "RGBA", "P": "RGBA", "RGB": "RGB", "RGBA": "RGBA", "RGBX": "RGB"}
@@ -129,15 +133,26 @@ def read_lens_facts(path: Path) -> tuple:
         return (size, *(str(tables[table].get(tag)) for tag, table in LENS_TAGS.items()))
 
 
-def check_pixels(path: Path) -> None:
-    """Decode a photograph, a JPEG at an eighth of its size, which takes a fraction of the time.
+def is_damaged(path: Path) -> bool:
+    """Return whether a photograph cannot be decoded, such as half of a JPEG.
+
+    A JPEG is decoded at an eighth of its size, which takes a fraction of the time.
 
     Raises:
-        MivolError: a damaged photograph, such as half of a JPEG.
+        MivolError: a HEIC image on a machine without pillow-heif.
     """
-    with _opened(path) as image:
-        image.draft(None, (1, 1))
-        _loaded(image, path)
+    if path.suffix.lower() in HEIC:
+        _register_heif(path)
+    try:
+        if path.suffix.lower() == ".exr":
+            _read_exr(path)
+            return False
+        with _opened(path) as image:
+            image.draft(None, (1, 1))
+            _loaded(image, path)
+    except MivolError:
+        return True
+    return False
 
 
 def write_upright(path: Path, copy: Path, orientation: int) -> None:
@@ -277,7 +292,7 @@ def _read_exr(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
     """Open an image and read its header. The size is unlimited, because the caller checks the memory before reading pixels."""
-    if path.suffix.lower() in (".heic", ".heif"):
+    if path.suffix.lower() in HEIC:
         _register_heif(path)
     bound, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:

@@ -24,8 +24,8 @@ from typing import Any
 
 from mivol.errors import MivolError
 from mivol.files.source import refusal
-from mivol.photos.listing import find_mask, list_photographs, split_numbers
-from mivol.photos.photo_file import check_pixels, read_lens_facts, read_photo_header, write_upright
+from mivol.photos.listing import find_mask, list_photographs, name_first, split_numbers
+from mivol.photos.photo_file import is_damaged, read_lens_facts, read_mask, read_photo_header, write_upright
 from mivol.photos.survey import find_format
 from mivol.threads import follow_program
 
@@ -99,8 +99,7 @@ class Poses:
             )
         apart = {name for names in self.others for name in names}
         if unposed := [name for name in self.unposed if name not in apart]:
-            named = ", ".join(map(self._name_unposed, unposed[:5])) + (" ..." if len(unposed) > 5 else "")
-            lines.append(f"without a pose: {named}; {AGAIN}")
+            lines.append(f"without a pose: {name_first(list(map(self._name_unposed, unposed)))}; {AGAIN}")
         return "\n".join(lines)
 
     def _name_unposed(self, name: str) -> str:
@@ -120,13 +119,14 @@ def find_poses(folder: Path, say: Callable[[str], None] = lambda line: None, is_
         is_video: whether the photographs are frames of a video, in the order of their names.
 
     Raises:
-        MivolError: a missing pycolmap, poses that exist already, too few photographs, a damaged photograph, or photographs
-            without overlap.
+        MivolError: a missing pycolmap, poses that exist already, too few photographs, a damaged mask, or photographs without
+            overlap.
         KeyboardInterrupt: Ctrl-C; features and matches stay in ``WORK``, and the next search of the same photographs
             continues with them.
     """
     images, names = _check_folder(folder)
-    names = sorted(_leave_out_copies(folder, images, names, say), key=split_numbers)
+    names = _leave_out_copies(folder, images, _leave_out_damaged(folder, images, names, say), say)
+    names = sorted(names, key=split_numbers)
     work = folder / WORK
     _begin_work(work, images, names)
     try:
@@ -207,6 +207,22 @@ def _check_count(folder: Path, count: int, words: str) -> None:
         raise refusal(folder, found, f"at least {FEWEST}, and 20 or more for a fit", "photograph the subject from more sides")
 
 
+def _leave_out_damaged(folder: Path, images: Path, names: list[str], say: Callable[[str], None]) -> list[str]:
+    """The names without files that cannot be decoded.
+
+    Raises:
+        MivolError: too few sound photographs.
+    """
+    damaged = [name for name in names if is_damaged(images / name)]
+    if not damaged:
+        return names
+    found = f"{len(damaged)} of {len(names)} photographs are damaged and left out: {name_first(damaged)}"
+    say(f"{found}; copy them again, remove the poses and search again to have them too")
+    kept = [name for name in names if name not in set(damaged)]
+    _check_count(folder, len(kept), "without damage")
+    return kept
+
+
 def _leave_out_copies(folder: Path, images: Path, names: list[str], say: Callable[[str], None]) -> list[str]:
     """The names without files equal to an earlier one: a pair of equal photographs has no parallax.
 
@@ -230,7 +246,7 @@ def _prepare(images: Path, names: list[str], work: Path, aliases: Mapping[str, s
         Number of masks.
 
     Raises:
-        MivolError: a damaged photograph or mask.
+        MivolError: a damaged mask.
     """
     headers, masks = {name: read_photo_header(images / name) for name in names}, 0
     turns = any(header.orientation > 4 for header in headers.values())
@@ -246,6 +262,7 @@ def _prepare(images: Path, names: list[str], work: Path, aliases: Mapping[str, s
         _prepare_file(images / name, copy, orientation)
         if (mask := find_mask(images / name)) is not None:
             masks += 1
+            read_mask(mask)  # refuses a damaged mask, which COLMAP would ignore
             _prepare_file(mask, work / "masks" / f"{aliases.get(name, name)}.png", orientation)
     return masks
 
@@ -254,7 +271,6 @@ def _prepare_file(file: Path, copy: Path, orientation: int) -> None:
     """Link an image, or convert it if COLMAP reads no such file, or not upright."""
     copy.parent.mkdir(parents=True, exist_ok=True)
     if orientation == 1 and file.suffix.lower() in DIRECT:
-        check_pixels(file)
         _link(file.absolute(), copy)
     else:
         write_upright(file, copy, orientation)

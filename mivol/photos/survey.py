@@ -19,12 +19,11 @@ import numpy as np
 from mivol.display import format_point, with_short_repr
 from mivol.errors import MivolError
 from mivol.files.source import refusal
-from mivol.photos import region
+from mivol.photos import app_exports, region
 from mivol.photos.camera import Camera, field_of_view
 from mivol.photos.colmap import find_model, read_colmap
-from mivol.photos.listing import UNLISTED, Entry, Listing, find_mask, find_shrink, list_photographs
+from mivol.photos.listing import UNLISTED, Entry, Listing, find_mask, find_shrink, list_photographs, name_first
 from mivol.photos.llff import read_llff
-from mivol.photos.phone_exports import is_arkit, is_polycam, is_record3d, read_arkit, read_polycam, read_record3d
 from mivol.photos.photo_file import PhotoHeader, read_photo_header
 from mivol.photos.transforms import read_blender, read_transforms
 
@@ -47,9 +46,10 @@ DATA_SET_FORMATS: dict[str, DataSetFormat] = {
     ),
     "COLMAP": DataSetFormat(lambda path: find_model(path) is not None, read_colmap),
     "LLFF": DataSetFormat(lambda path: (path / "poses_bounds.npy").is_file() or path.name == "poses_bounds.npy", read_llff),
-    "Polycam": DataSetFormat(is_polycam, read_polycam),
-    "Record3D": DataSetFormat(is_record3d, read_record3d),
-    "ARKit (3D Scanner App)": DataSetFormat(is_arkit, read_arkit),
+    "Polycam": DataSetFormat(app_exports.is_polycam, app_exports.read_polycam),
+    "Record3D": DataSetFormat(app_exports.is_record3d, app_exports.read_record3d),
+    "ARKit (3D Scanner App)": DataSetFormat(app_exports.is_arkit, app_exports.read_arkit),
+    "RealityCapture": DataSetFormat(app_exports.is_reality_capture, app_exports.read_reality_capture),
 }
 
 
@@ -118,8 +118,7 @@ class PhotoSurvey:
             f"near {self.near_far[0]:.4g}, far {self.near_far[1]:.4g} from the cameras",
         ]
         if self.skipped:
-            named = ", ".join(self.skipped[:5]) + (" ..." if len(self.skipped) > 5 else "")
-            lines.append(f"skipped {len(self.skipped)} missing photographs: {named}")
+            lines.append(f"skipped {len(self.skipped)} missing photographs: {name_first(self.skipped)}")
         return "\n".join([*lines, *self.notes])
 
 
@@ -188,9 +187,9 @@ def _leave_out_views(frames: list[PhotoFrame], box: np.ndarray, is_given: bool) 
         region.check_views([frame.camera for frame in frames], box)
     if not away:
         return frames, []
-    named = ", ".join(away[:5]) + (" ..." if len(away) > 5 else "")
     kept = [frame for frame, does in zip(frames, meets, strict=True) if does]
-    return kept, [f"left out: {named}, which by their poses look away from what the others show; their poses may be wrong"]
+    away_from = "look away from what the others show; their poses may be wrong"
+    return kept, [f"left out: {name_first(away)}, which by their poses {away_from}"]
 
 
 def find_format(path: Path) -> str | None:

@@ -16,6 +16,7 @@ from mivol.errors import MivolError
 from mivol.files import ply
 from mivol.photos import load_photos, survey_photos
 from mivol.photos.camera_path import HomeView
+from mivol.photos.lens import Lens
 from mivol.photos.listing import find_shrink
 from mivol.photos.photo_file import ORIENTATION, TURNS
 from mivol.points import read_gaussians, write_gaussians
@@ -207,8 +208,60 @@ def test_exports_of_phones(tmp_path: Path, kind: str, name: str) -> None:
 
 def test_record3d_may_have_a_lens_for_each_frame(tmp_path: Path) -> None:
     folder = write_export(tmp_path / "scan", "record3d")
+    edit(folder / "metadata.json", lambda table: table.update(perFrameIntrinsicCoeffs=[]))
+    assert [frame.camera.K[0, 0] for frame in survey_photos(folder).frames] == [20, 20, 20]
     edit(folder / "metadata.json", lambda table: table.update(perFrameIntrinsicCoeffs=[[30 + k, 31, 12, 8] for k in range(3)]))
     assert [frame.camera.K[0, 0] for frame in survey_photos(folder).frames] == [30, 31, 32]
+
+
+def test_polycam_without_corrected_cameras_has_those_of_the_phone(tmp_path: Path) -> None:
+    """Long scans have empty folders of corrected cameras."""
+    keyframes = write_export(tmp_path / "scan", "polycam") / "keyframes"
+    for part in ("cameras", "images"):
+        (keyframes / f"corrected_{part}").rename(keyframes / part)
+        (keyframes / f"corrected_{part}").mkdir()
+    assert [frame.file.parent.name for frame in survey_photos(tmp_path / "scan").frames] == ["images"] * 3
+
+
+def write_reality_capture(folder: Path, lens: tuple[str, ...], values: tuple[float, ...]) -> Path:
+    """The ring as RealityCapture writes it: bearings from +y to +x, pitch from straight down; focal length 30 of 24 pixels."""
+    (folder / "images").mkdir(parents=True)
+    lines = ["#cameras 3", ",".join(["#name", "x", "y", "alt", "heading", "pitch", "roll", "f", *lens])]
+    for k, pose in enumerate(ring(3)):
+        Image.fromarray(pixels(24, 16, k, alpha=False)).save(folder / "images" / f"{k}.jpg")
+        x, y, z = pose[:3, 3]
+        pitch = 90 - np.degrees(np.arctan2(z, np.hypot(x, y)))
+        row = [f"{k}.jpg", x, y, z, np.degrees(np.arctan2(-x, -y)), pitch, 0, 45.0, *values]
+        lines.append(",".join(map(str, row)))
+    (folder / "cameras.csv").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def test_cameras_of_reality_capture(tmp_path: Path) -> None:
+    """45 mm on 36 mm of film is 30 of 24 pixels; 1/24 of the longer edge is a pixel."""
+    folder = write_reality_capture(tmp_path / "bare", (), ())
+    for name, middle, lens in (("bare", (12, 8), Lens()), ("lens", (13, 7), Lens(k1=0.01, k4=0.02, p1=0.003, p2=0.004))):
+        if name == "lens":
+            columns = ("px", "py", "k1", "k4", "t1", "t2")
+            folder = write_reality_capture(tmp_path / "lens", columns, (1 / 24, -1 / 24, 0.01, 0.02, 0.003, 0.004))
+        survey = survey_photos(folder)
+        assert survey.format == "RealityCapture" and [frame.file.name for frame in survey.frames] == ["0.jpg", "1.jpg", "2.jpg"]
+        for frame, pose in zip(survey.frames, ring(3), strict=True):
+            np.testing.assert_allclose(frame.camera.to_world, pose, atol=1e-12)
+            np.testing.assert_allclose(frame.camera.K, [[30, 0, middle[0]], [0, 30, middle[1]], [0, 0, 1]])
+            assert frame.camera.distortion == lens
+    assert survey_photos(folder / "cameras.csv").format == "RealityCapture"
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [(",1,2,3,0,90,0,45", "the row ,1,2,3"), ("3.jpg,1,2,3,0,ninety,0,45", "pitch of 1 values, or not of numbers")],
+)
+def test_wrong_rows_of_reality_capture_are_refused(tmp_path: Path, line: str, message: str) -> None:
+    file = write_reality_capture(tmp_path / "set", (), ()) / "cameras.csv"
+    file.write_text(file.read_text() + line + "\n")
+    with pytest.raises(MivolError, match=message):
+        survey_photos(tmp_path / "set")
 
 
 BAD_EXPORTS = {

@@ -131,11 +131,28 @@ def test_what_cannot_have_poses_is_refused(folder: Path, job: dict, tmp_path: Pa
         poses.find_poses(tmp_path / "few")
     with pytest.raises(MivolError, match="found no folder"):
         poses.find_poses(tmp_path / "none")
-    whole = (folder / "images" / "a.jpg").read_bytes()
-    for content in (b"no image", whole[: len(whole) // 2]):
-        (folder / "images" / "a.jpg").write_bytes(content)
-        with pytest.raises(MivolError, match=r"a.jpg: found a damaged or foreign file"):
-            poses.find_poses(folder)
+
+
+def test_damaged_photographs_are_left_out_and_named(folder: Path, job: dict) -> None:
+    """Half of a JPEG and a text are left out; with too few others the search is refused before it begins."""
+    images, said = folder / "images", []
+    whole = (images / "near" / "d.jpg").read_bytes()
+    (images / "a.jpg").write_bytes(b"no image")
+    (images / "near" / "e.jpg").write_bytes(whole[: len(whole) // 2])
+    poses.find_poses(folder, said.append)
+    assert any(line.startswith("2 of 5 photographs are damaged and left out: a.jpg, near/e.jpg; copy") for line in said)
+    assert job["order"] == ["b.png", "near/c.webp", "near/d.jpg"]
+    shutil.rmtree(folder / "sparse")
+    (images / "b.png").write_bytes(b"")
+    with pytest.raises(MivolError, match="found 2 photographs without damage, expected at least 3"):
+        poses.find_poses(folder)
+
+
+def test_a_damaged_mask_is_refused(folder: Path, job: dict) -> None:
+    (folder / "masks").mkdir()
+    (folder / "masks" / "a.png").write_bytes(b"no image")
+    with pytest.raises(MivolError, match=r"masks/a.png: found a damaged or foreign file"):
+        poses.find_poses(folder)
 
 
 def test_copies_are_left_out(folder: Path, job: dict) -> None:

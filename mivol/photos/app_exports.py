@@ -1,9 +1,9 @@
-"""Poses that phones export: raw data of Polycam and Record3D, and frames of ARKit by 3D Scanner App.
+"""Poses that apps export: Polycam, Record3D, 3D Scanner App (ARKit) and RealityCapture.
 
-Conventions. All three write ARKit's poses: camera to world with the axes of :mod:`mivol.photos.camera`, y up in the world, in
-metres, of the pixels as they are stored.
+Conventions. The phones write ARKit's poses: camera to world with the axes of :mod:`mivol.photos.camera`, y up in the world, in
+metres, of the pixels as they are stored. RealityCapture has z up. NeRFCapture and KIRI Engine write ``transforms.json``.
 
-Sources, looked up in programs that read them (nerfstudio, polyform, usa):
+Sources, looked up in programs that read them (nerfstudio, polyform, usa, brush):
 
 * Polycam: ``keyframes/corrected_cameras/ID.json`` for ``keyframes/corrected_images/ID.jpg``, without them ``cameras`` and
   ``images``; focal lengths, principal point, size, and the rows ``t_00`` to ``t_23`` of the pose.
@@ -11,12 +11,17 @@ Sources, looked up in programs that read them (nerfstudio, polyform, usa):
   ``poses`` (x, y, z, w of the quaternion, position), for ``rgb/N.jpg`` or ``rgbd/N.jpg``. ``perFrameIntrinsicCoeffs`` (fx, fy,
   cx, cy) of newer versions take precedence.
 * 3D Scanner App: ``frame_N.json`` for ``frame_N.jpg``, with ``intrinsics`` and ``cameraPoseARFrame`` row by row.
+* RealityCapture ("Internal/External camera parameters"): a row of a CSV file for each photograph, beside it or in ``images``.
+  The pose is ``x``, ``y``, ``alt``, and the rotations by -``heading`` about z, ``pitch`` about x and ``roll`` about y [degree].
+  ``f`` is for 36 mm film, whose length is the longer edge. ``px`` and ``py`` are from the middle, over the longer edge.
+  ``k1`` to ``k4``, ``t1`` and ``t2`` are those of :class:`~mivol.photos.lens.Lens`. Columns of the lens may be missing.
 """
 
 from __future__ import annotations
 
+import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +30,17 @@ from scipy.spatial.transform import Rotation
 
 from mivol.files.source import read_bytes, refusal
 from mivol.photos.camera import Camera, intrinsics
+from mivol.photos.lens import Lens
 from mivol.photos.listing import Entry, Listing, find_image, split_numbers
 
 CORRECTED, PLAIN = ("corrected_cameras", "corrected_images"), ("cameras", "images")
 """Folders of cameras and images of Polycam: after and before its bundle adjustment."""
+
+POSE_COLUMNS = ("x", "y", "alt", "heading", "pitch", "roll", "f")
+"""Columns of RealityCapture beside the name, which every file has."""
+
+FILM = 36.0
+"""Longer edge of the film of RealityCapture's focal lengths [mm]."""
 
 
 def is_polycam(path: Path) -> bool:
@@ -44,6 +56,11 @@ def is_record3d(path: Path) -> bool:
 def is_arkit(path: Path) -> bool:
     """Whether a folder holds frames of 3D Scanner App."""
     return path.is_dir() and next(path.glob("frame_*.json"), None) is not None
+
+
+def is_reality_capture(path: Path) -> bool:
+    """Whether a path is, or a folder holds, a CSV file of RealityCapture's cameras."""
+    return _reality_capture_file(path) is not None
 
 
 def read_polycam(path: Path) -> Listing:
@@ -75,7 +92,7 @@ def read_record3d(path: Path) -> Listing:
     size = _whole_size(file, *(_numbers(file, table, key, 0) for key in ("w", "h")))
     poses = _numbers(file, table, "poses", (-1, 7))
     lenses = None
-    if "perFrameIntrinsicCoeffs" in table:
+    if table.get("perFrameIntrinsicCoeffs"):
         lenses = _numbers(file, table, "perFrameIntrinsicCoeffs", (len(poses), 4))
     entries = []
     for number, row in enumerate(poses):
@@ -104,10 +121,65 @@ def read_arkit(path: Path) -> Listing:
     return Listing(kept or entries)
 
 
+def read_reality_capture(path: Path) -> Listing:
+    """Read a CSV file of RealityCapture's cameras.
+
+    Raises:
+        MivolError: a row without a name, or a value that is no finite number.
+    """
+    file = _reality_capture_file(path)
+    lines = read_bytes(file).decode("utf-8-sig", errors="replace").splitlines()
+    head = next(number for number, line in enumerate(lines) if _column_names(line))
+    entries = []
+    for row in csv.DictReader(lines[head + 1 :], _column_names(lines[head])):
+        name = (row.get("name") or "").replace("\\", "/")
+        if not name:
+            raise refusal(
+                file, f"the row {','.join(map(str, row.values()))}", "the name of a photograph first", "export it again"
+            )
+        entries.append(_reality_capture_entry(file, name, row))
+    return Listing(entries)
+
+
+def _reality_capture_file(path: Path) -> Path | None:
+    """The first CSV file with RealityCapture's columns in its first or second line; the first may count the cameras."""
+    files = [path] if path.suffix.lower() == ".csv" else sorted(path.glob("*.csv")) if path.is_dir() else []
+    for file in files:
+        with file.open(encoding="utf-8-sig", errors="replace") as lines:
+            if any(_column_names(line) for _, line in zip(range(2), lines, strict=False)):
+                return file
+    return None
+
+
+def _column_names(line: str) -> list[str]:
+    """The columns of RealityCapture's file, if a line names them."""
+    names = line.strip().removeprefix("#").lower().split(",")
+    return names if {"name", *POSE_COLUMNS} <= set(names) else []
+
+
+def _reality_capture_entry(file: Path, name: str, row: Mapping[str, str]) -> Entry:
+    image = next((found for place in ("images", "") if (found := find_image(file.parent / place / name)).is_file()), None)
+    image = image or find_image(file.parent / name)
+    pose = {key: _numbers(file, dict(row), key, 0) for key in POSE_COLUMNS}
+    more = {key: _numbers(file, dict(row), key, 0) for key in ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2") if row.get(key)}
+    turn = Rotation.from_euler("ZXY", [-pose["heading"], pose["pitch"], pose["roll"]], degrees=True).as_matrix()
+    to_world = _to_world(np.column_stack([turn, [pose["x"], pose["y"], pose["alt"]]]))
+    terms = {"t1": "p1", "t2": "p2"}
+    lens = Lens(**{terms.get(key, key): value for key, value in more.items() if key not in ("px", "py")})
+
+    def camera(size: tuple[int, int]) -> Camera:
+        edge = max(size)
+        middle = (size[0] / 2 + edge * more.get("px", 0.0), size[1] / 2 + edge * more.get("py", 0.0))
+        return Camera(intrinsics(*2 * [edge * pose["f"] / FILM], *middle), size, to_world, lens, f"{file.name} {name}")
+
+    return Entry(name, image, camera)
+
+
 def _polycam_folders(path: Path) -> tuple[Path, Path] | None:
-    for cameras, images in (CORRECTED, PLAIN):
-        if (path / "keyframes" / cameras).is_dir() and (path / "keyframes" / images).is_dir():
-            return path / "keyframes" / cameras, path / "keyframes" / images
+    """Folders of cameras and images of Polycam, of which the corrected ones may be missing or empty."""
+    for cameras, images in ((path / "keyframes" / a, path / "keyframes" / b) for a, b in (CORRECTED, PLAIN)):
+        if next(cameras.glob("*.json"), None) is not None and images.is_dir():
+            return cameras, images
     return None
 
 
