@@ -125,6 +125,23 @@ def test_density_under_a_sky(density, albedo):
     assert_gradient(gradients(seen, GRID, w, 512), truth[..., None], density, rounding=2e-3 if albedo else 2e-5)
 
 
+@pytest.mark.statistical
+def test_beside_an_emitter_whose_light_no_path_finds():
+    """A surface that shines along its normal only; Mitsuba cannot evaluate its light, and it adds none."""
+    parts = {"smoke": smoke(rough_grid(2))[0], "bulb": point([1.5, 1, 2.0])[0]}
+    above = mi.ScalarTransform4f().translate([0, 0, 9])
+    beam = {"type": "rectangle", "to_world": above, "emitter": {"type": "directionalarea"}}
+    key, ours, w = MEDIUM + "sigma_t.data", mi.load_dict(mivol(max_depth=3)), np.ones((8, 8, 3))
+    found, judge = (
+        Moments.from_values(
+            np.stack([vjp(scene, key, w, 16, fresh(s), ours).sum(keepdims=True) for s in range(first, first + BATCHES)])
+        )
+        for scene, first in ((small.close_up(parts | {"beam": beam}, res=8), 0), (small.close_up(parts, res=8), 100))
+    )
+    assert_same_mean(found, judge, what="derivatives by the density")
+    assert_precise(small.difference(found, judge), 0.05 * np.abs(judge.mean), what="derivatives by the density")
+
+
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_constvolume_whose_density_is_its_majorant():

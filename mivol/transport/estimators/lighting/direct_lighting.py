@@ -28,6 +28,7 @@ from mivol.transport.estimators.lighting.emitters import (
     ChosenEmitter,
     EventSamples,
     SceneEmitters,
+    eval_direction,
     is_among,
 )
 from mivol.transport.estimators.lighting.moving_emitters import attach_position, moving_transmittance
@@ -244,7 +245,7 @@ class DirectLighting:
                 placed, _ = sample.emitter.sample_direction(it, sample.u, on)
                 if dr.grad_enabled(placed.p):
                     moved = attach_position(placed, direct)
-                source = sample.emitter.eval_direction(it, moved, on) / direct.pdf
+                source = eval_direction(sample.emitter, it, moved, on) / direct.pdf
                 if dr.grad_enabled(moved.p):
                     source = source * moving_transmittance(self.media, ray_segment, tau, moved.p, on)
                 if not dr.grad_enabled(source, moved):

@@ -39,6 +39,8 @@ __all__ = [
 
 UNIFORM_EMITTER = "ConstantBackgroundEmitter"
 """Mitsuba's class of a constant environment, whose light is found by phase samples alone."""
+PARALLEL_AREA = "DirectionalArea"
+"""Mitsuba's class of a surface that shines along its normal only. No path finds its light, and ``eval_direction`` raises."""
 
 
 class SceneEmitters:
@@ -225,6 +227,20 @@ class _EmitterTable:
         """Centre and radius of an emitter [length], and whether its distance is finite."""
         x, y, z, r, finite = (dr.gather(mi.Float, column, number) for column in self.balls)
         return x, y, z, r, finite > 0
+
+
+def eval_direction(
+    emitter: mi.EmitterPtr, it: mi.Interaction3f, direct: mi.DirectionSample3f, active: mi.Bool
+) -> mi.Color3f:
+    """Radiance from the sampled place on an emitter towards a point [radiance]."""
+    return dr.dispatch(emitter, _eval_implemented_direction, it, direct, active)
+
+
+def _eval_implemented_direction(
+    emitter: mi.Emitter, it: mi.Interaction3f, direct: mi.DirectionSample3f, active: mi.Bool
+) -> mi.Color3f:
+    # Dr.Jit records the call for every emitter in memory, those of other scenes too.
+    return mi.Color3f(0) if emitter.class_name() == PARALLEL_AREA else emitter.eval_direction(it, direct, active)
 
 
 def join_arrays(values: list[mi.Float] | list[mi.UInt32], at_once: int = 16) -> mi.Float | mi.UInt32:
