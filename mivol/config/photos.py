@@ -308,7 +308,10 @@ class GaussianSettings(Section):
     control: Annotated[str | None, setting("1", "density control: clone_split or relocation; absent: preset")] = None
     ssim: Annotated[float, setting("1", "weight of SSIM in the loss; absent: preset", ge=0, le=1)] | None = None
     mip: Annotated[bool, setting("1", "keep the light of Gaussians smaller than a pixel, for other sizes")] = False
-    exposure: Annotated[bool, setting("1", "gains of each photograph, for photographs without alpha")] = False
+    exposure: (
+        Annotated[bool, setting("1", "gains of each photograph without alpha; absent: if common points differ in exposure")]
+        | None
+    ) = None
     poses: Annotated[bool, setting("1", "cameras move with the fit, for poses that are off by a pixel or more")] = False
     views: Annotated[int, setting("1", "photographs of a step, which workers of a cluster share; fewer steps then", ge=1)] = 1
 

@@ -32,6 +32,7 @@ from mivol.optim.photographs.radiance_plan import FEW_PHOTOGRAPHS
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.strategy import suggest_name
 from mivol.photos import Camera, Photo, Photos, project, rays, rectify
+from mivol.photos.exposures import Exposures, measure_exposures
 from mivol.photos.region import FEWEST_POINTS, count_views, is_free_space, points_in_box, viewing_distance
 from mivol.points import Gaussians, write_gaussians
 from mivol.points.gaussians import to_base_harmonics
@@ -175,7 +176,8 @@ def make_gaussian_plan(settings: GaussianExperiment) -> GaussianPlan:
         raise MivolError(f'gaussians.control = "{options.control}" is unknown: {suggest_name(options.control, list(CONTROLS))}')
     given = {name: getattr(options, name) for name in ("start", "most", "control", "ssim")}
     overrides = {name: value for name, value in given.items() if value is not None}
-    plan = replace(PRESETS[options.preset], mip=options.mip, exposure=options.exposure, poses=options.poses, **overrides)
+    overrides |= {"mip": options.mip, "poses": options.poses, "exposure": bool(options.exposure)}
+    plan = replace(PRESETS[options.preset], **overrides)
     if options.degree is not None:
         stages = [replace(stage, degree=min(stage.degree, options.degree)) for stage in plan.stages]
         plan = replace(plan, stages=(*stages[:-1], replace(stages[-1], degree=options.degree)))
@@ -192,10 +194,13 @@ def start_gaussians(settings: GaussianExperiment, photos: Photos, plan: Gaussian
     views = tuple(rectify(view) for view in photos.views)
     longest = max(max(view.camera.size) for view in views)
     plan = plan.for_edge(longest)
+    exposures = None
     is_capture = settings.photos.background == "" and any(view.alpha is None for view in views)
     if is_capture:
         plan = adapt_to_few(plan, len(views)) if settings.gaussians.degree is None else plan
         plan = replace(plan, reach=viewing_distance([view.camera for view in views], photos.box))
+        exposures = measure_exposures(photos.views) if settings.gaussians.exposure is None else None
+        plan = replace(plan, exposure=plan.exposure if exposures is None else exposures.differ)
     places, whence = find_start_points(photos, plan.start, settings.seed, is_capture)
     cloud = make_start_cloud(places, views, plan.stages[0].degree)
     if is_capture:
@@ -211,7 +216,7 @@ def start_gaussians(settings: GaussianExperiment, photos: Photos, plan: Gaussian
     taken = sum(view.image.size // 3 * channels // shrink**2 for view in views for shrink in sizes)
     memory = check_memory(replace(plan, start=len(cloud["means"])), taken, pixels)
     batches = RayBatches.from_photos(views, [stage.shrink for stage in plan.stages])
-    lines = explain_plan(plan, photos, len(cloud["means"]), whence, memory, plan.minutes(largest))
+    lines = explain_plan(plan, photos, len(cloud["means"]), whence, memory, plan.minutes(largest), exposures)
     return GaussianStart(views, plan, batches, cloud, lines)
 
 
@@ -224,7 +229,26 @@ def adapt_to_few(plan: GaussianPlan, photographs: int) -> GaussianPlan:
 GAINS = PlanLine(choice="gains of each photograph", reason="for cameras with automatic exposure; with a prior towards 1")
 
 
-def explain_plan(plan: GaussianPlan, photos: Photos, count: int, whence: str, memory: str, minutes: float) -> list[PlanLine]:
+def explain_gains(plan: GaussianPlan, exposures: Exposures | None) -> list[PlanLine]:
+    """Return whether photographs have gains, if they do or if their exposures were measured."""
+    if exposures is None:
+        return [GAINS][: plan.exposure]
+    facts = (
+        f"common points differ in brightness by {exposures.spread:.0%} between photographs, by {exposures.unpredicted:.0%} "
+        f"from what the nearest photographs predict, and by {exposures.rest:.0%} from each other"
+    )
+    return [PlanLine(choice=f"{'' if plan.exposure else 'no '}gains of each photograph", reason=facts)]
+
+
+def explain_plan(
+    plan: GaussianPlan,
+    photos: Photos,
+    count: int,
+    whence: str,
+    memory: str,
+    minutes: float,
+    exposures: Exposures | None,
+) -> list[PlanLine]:
     """Return the choices of the plan with their reasons."""
     stages = [f"{stage.steps} of photographs shrunk by {stage.shrink}, degree {stage.degree}" for stage in plan.stages]
     behind = "alpha marks the object" if photos.views[0].alpha is not None else "photos.background"
@@ -244,7 +268,7 @@ def explain_plan(plan: GaussianPlan, photos: Photos, count: int, whence: str, me
         PlanLine(choice=f"a loss with a share of {plan.ssim:g} of SSIM", reason="the rest is the absolute error"),
         *explain_capture(plan, len(photos.views)),
         background,
-        *[GAINS][: plan.exposure],
+        *explain_gains(plan, exposures),
         *[MOTIONS][: plan.poses],
         PlanLine(choice=f"about {minutes:.2g} minutes", reason="for two idle cores; the number of steps is fixed"),
         PlanLine(choice=memory, reason="estimated before the allocation"),
