@@ -234,8 +234,8 @@ def explain_gains(plan: GaussianPlan, exposures: Exposures | None) -> list[PlanL
     if exposures is None:
         return [GAINS][: plan.exposure]
     facts = (
-        f"common points differ in brightness by {exposures.spread:.0%} between photographs, by {exposures.unpredicted:.0%} "
-        f"from what the nearest photographs predict, and by {exposures.rest:.0%} from each other"
+        f"common points differ in brightness by {exposures.spread:.0%} between photographs, and by "
+        f"{exposures.unpredicted:.0%} from what the nearest photographs predict"
     )
     return [PlanLine(choice=f"{'' if plan.exposure else 'no '}gains of each photograph", reason=facts)]
 

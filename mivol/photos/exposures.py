@@ -30,29 +30,24 @@ NEIGHBOURS = 2
 DIFFER = 0.08
 """Unpredicted gains from which photographs need gains in a fit: of sRGB codes, a fifth of the exposure."""
 
-CLEAR = 3.0
-"""Unpredicted gains over the rest from which they are certain: highlights and shadows also change single points."""
-
 
 @dataclass(frozen=True)
 class Exposures:
-    """Gains that explain the brightness of common points, and what they leave, in natural logarithms.
+    """Gains that explain the brightness of common points, in natural logarithms.
 
     Attributes:
         spread: standard deviation of the gains.
         unpredicted: standard deviation of their differences from what the ``NEIGHBOURS`` nearest cameras predict, weighted by
             the inverse distance. Colours that depend on the direction can show what neighbours predict without gains.
-        rest: median of the absolute differences of single points beside the gains.
     """
 
     spread: float
     unpredicted: float
-    rest: float
 
     @property
     def differ(self) -> bool:
         """Whether a fit needs gains."""
-        return self.unpredicted >= max(DIFFER, CLEAR * self.rest)
+        return self.unpredicted >= DIFFER
 
 
 def measure_exposures(views: Sequence[Photo]) -> Exposures | None:
@@ -74,8 +69,7 @@ def measure_exposures(views: Sequence[Photo]) -> Exposures | None:
     distance, nearest = (found[:, 1:] for found in cKDTree(origins).query(origins, NEIGHBOURS + 1))
     weight = 1 / np.maximum(distance, 1e-9 * np.ptp(origins))
     predicted = (weight * gains[nearest]).sum(axis=1) / weight.sum(axis=1)
-    rest = np.median(np.abs(logs - means[point] - gains[number]))
-    return Exposures(float(gains.std()), float((gains - predicted).std()), float(rest))
+    return Exposures(float(gains.std()), float((gains - predicted).std()))
 
 
 def _read_brightness(view: Photo) -> tuple[np.ndarray, np.ndarray]:

@@ -41,20 +41,7 @@ def test_known_gains_are_found_and_those_of_pairs_are_predicted() -> None:
     for gains, differ in ((np.repeat(steps, 2), False), (opposite, True), (np.ones(16), False)):
         found = measure_exposures(photograph(gains))
         assert found.spread == pytest.approx(np.log(gains).std(), abs=1e-6)
-        assert found.differ == differ and (found.unpredicted >= DIFFER) == differ and found.rest < 1e-6
-
-
-def test_highlights_are_no_exposure() -> None:
-    """Gains of pairs differ by 0.2 in logarithms: they are certain unless single points differ by a third of that."""
-    rng = np.random.default_rng(3)
-    for noise, differ in ((0.01, True), (0.2, False)):
-        views = photograph(np.exp(0.1 * np.tile([1.0, -1], 8)))
-        views = [
-            replace(view, image=view.image * np.exp(noise * rng.standard_normal(view.image.shape[:2]))[..., None])
-            for view in views
-        ]
-        found = measure_exposures(views)
-        assert found.differ == differ and found.unpredicted > DIFFER
+        assert found.differ == differ and (found.unpredicted >= DIFFER) == differ
 
 
 def test_bad_pixels_do_not_count() -> None:
@@ -79,5 +66,5 @@ def test_gaussians_have_gains_if_exposures_differ(variant_rgb: str, tmp_path: Pa
     start = start_gaussians(chosen, load_photos(folder), make_gaussian_plan(chosen))
     assert start.plan.exposure == has_gains
     reasons = [line.reason for line in start.lines if "gains" in line.choice]
-    facts = "common points differ in brightness by 26% between photographs, by 51% from what the nearest photographs predict"
-    assert reasons == [f"{facts}, and by 0% from each other"] * has_gains
+    facts = "common points differ in brightness by 26% between photographs, and by 51% from what the nearest photographs"
+    assert reasons == [f"{facts} predict"] * has_gains
