@@ -129,9 +129,10 @@ def refine_geometry(
             f"the axis tilted by {along:.3f} +- {along_sigma:.3f} degrees along the light and {across:.3f} +- "
             f"{across_sigma:.3f} across it"
         )
-        if is_cut_off(data.y, data.weights):
+        if "shift" in names and is_cut_off(data.y, data.weights):
             lines.append(
-                "the object goes on beyond the first or last rows, so the tilt is wrong by up to several of these deviations"
+                "the object goes on beyond the first or last rows, so the tilt is wrong by up to several of these deviations: "
+                "leave shift out to see the tilt alone"
             )
     ratio = np.sqrt(found.after.mean() / max(found.before.mean(), 1e-30))
     judged = f"the residual of {len(found.after)} held-out views falls to {ratio:.2f}"

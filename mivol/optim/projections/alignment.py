@@ -1,10 +1,16 @@
 """Where the detector stood in each view: shifts, turns, the axis and its tilt, as unknowns of the fit.
 
-Rounds alternate between volume and geometry. A few iterations of pcg explain the projections with the geometry of the last
-round. Then the unknowns move by a Gauss-Newton step on the residual, whose derivatives are differences of the predicted views
-along rows and columns, or of predictions with another tilt. The volume continues from round to round. Its adaption to wrong
-views slows the rounds: an error of the geometry shrinks by a factor ``1 - c`` a round, where c is the share of the curvature
-that remains after the volume has adapted.
+Moves of views. Rounds alternate between volume and moves. A few iterations of pcg explain the projections with the geometry of
+the last round. Then the moves change by a Gauss-Newton step on the residual, whose derivatives are differences of the predicted
+views along rows and columns. The volume continues from round to round. Its adaption to wrong views slows the rounds: an error
+of the geometry shrinks by a factor ``1 - c`` a round, where c is the share of the curvature that remains after the volume has
+adapted.
+
+Axis and tilt. A volume adapts to a wrong tilt almost wholly where the detector cuts the object off, so the residual of its own
+views says little. Every fourth view is therefore predicted by a volume of the others, begun anew. The derivatives are
+differences of such predictions, so they include the adaption of the volume. Each predicted view pulls at the axis and the tilt.
+The variance has two parts: the scatter of these pulls (White 1980), and the noise of the volume, which pulls at all predicted
+views at once and is found by ``REPEATS`` volumes of views with more noise.
 
 Smoothing. Projections are smoothed by ``SMOOTHING`` pixels first, so an error of a pixel is a small fraction of a detail, and
 large detectors are averaged over blocks. Neighbouring residuals are then correlated. Counted as independent, they give
@@ -47,8 +53,20 @@ ROUNDS, ITERATIONS = 12, 6
 MOST_COLUMNS = 192
 """Columns above which pixels are averaged over blocks."""
 
-LARGEST_STEP, TILT_STEP = 2.0, 2e-3
-"""Largest move of a round [pixel], and half the difference of tilts [rad] of a derivative."""
+LARGEST_STEP = 2.0
+"""Largest move of a view in a round [pixel]."""
+
+COMMON_ROUNDS, FOLD = 3, 4
+"""Last rounds, in which axis and tilt move; every ``FOLD``-th view is predicted by the others."""
+
+SETTLED = 3 * ITERATIONS
+"""Iterations of a prediction: after a third of them, volumes of ellipsoids pull the tilt by several standard deviations."""
+
+REPEATS = 2
+"""Volumes of views with more noise."""
+
+COMMON_STEPS, LARGEST_COMMON = np.array([0.25, 4e-3, 4e-3]), np.array([2.0, 0.05, 0.05])
+"""Half the difference for a derivative, and the largest step: axis [pixel], tilts along the light and across it [rad]."""
 
 CLEAR, LEAST_GAIN, TINY = 4.0, 0.1, 1e-30
 """Standard errors, and logarithm of the ratio, by which the squared residual of held-out views must fall: their own three moves
@@ -132,20 +150,30 @@ def align_views(
     common += ([1] if own else [1, 2]) if "tilt" in refine else []
     step = min(10, max(2, len(y) // 8))
     judges = held_out if len(held_out) else np.arange(step // 2, len(y), step)
-    state = _State(np.zeros((len(y), 3)), np.zeros(3))
-    x = None
+    state, normal = _State(np.zeros((len(y), 3)), np.zeros(3)), np.empty(0)
+    x, predicted, slopes = None, smooth, None
     steps: list[np.ndarray] = []
-    for _ in range(rounds):
-        x, predicted = _predict(state.beam(small), coarse, smooth, mask, judges, x)
-        state, step, fit = _improve(state, small, coarse, x, smooth - predicted, mask, predicted, own, common)
-        steps.append(step)
+    common_sigma = np.zeros(3)
+    for k in range(rounds):
+        if own:
+            x, predicted = _predict(state.beam(small), coarse, smooth, mask, judges, x)
+            moves, normal = _move_views(predicted, smooth - predicted, mask, small.angles, own)
+            state = replace(state, moves=state.moves + moves)
+            steps.append(moves)
+        if common and k >= rounds - COMMON_ROUNDS:
+            is_last = k == rounds - 1
+            state, slopes, common_sigma = _move_axis(
+                state, small, coarse, smooth, mask, common, slopes if is_last else None, is_last
+            )
     before, after = (
         _misfit(at.beam(small), coarse, smooth, mask, judges) for at in (_State(0 * state.moves, 0 * state.common), state)
     )
     better = np.log(np.maximum(before, TINY) / np.maximum(after, TINY))
     is_needed = better.mean() > max(CLEAR * better.std(ddof=1) / math.sqrt(len(better)), LEAST_GAIN)
-    spread = _moves_spread(_slopes(predicted)[..., own], mask, fit.own) if own else np.empty(0)
-    sigma, common_sigma = _deviations(fit, float(after.mean()) * spread, steps, own, common)
+    sigma = np.zeros(3)
+    if own:
+        spread = _moves_spread(_slopes(predicted)[..., own], mask, normal)
+        sigma[own] = _deviations(float(after.mean()) * spread, np.array(steps)[..., own])
     moves, found = state.moves * [factor, factor, 1.0], state.common * [factor, 1.0, 1.0]
     shifted = _State(moves, found)
     axis = found[0] + moves[:, 1].mean(), (common_sigma[0] if common[:1] == [0] else sigma[1] / math.sqrt(len(y))) * factor
@@ -203,6 +231,13 @@ def _smooth(images: np.ndarray) -> np.ndarray:
     return gaussian_filter(images, (0, SMOOTHING if images.shape[1] >= 8 else 0, SMOOTHING), mode="nearest")
 
 
+def _smooth_variance(shape: tuple[int, int, int]) -> float:
+    """Variance of smoothed noise (views, rows, cols) over that before."""
+    point = np.zeros((1, *shape[1:]))
+    point[0, shape[1] // 2, shape[2] // 2] = 1.0
+    return float((_smooth(point) ** 2).sum())
+
+
 def _predict(
     beam: ParallelBeam | ConeBeam,
     grid: VoxelGrid,
@@ -210,6 +245,7 @@ def _predict(
     mask: np.ndarray,
     judges: np.ndarray,
     start: np.ndarray | None,
+    iterations: int = ITERATIONS,
 ) -> tuple[np.ndarray, np.ndarray]:
     """A volume of the views that do not judge, and its projections (views, rows, cols)."""
     a = Projector(beam, grid)
@@ -218,7 +254,7 @@ def _predict(
     if start is None:
         start = _filtered(part, y[kept])
     problem = LeastSquares(part, y[kept], mask[kept], start, nonnegative=True)
-    state = last_state(projected_cg(problem), ITERATIONS)
+    state = last_state(projected_cg(problem), iterations)
     x = start if state is None else state.x
     return x, (a @ np.reshape(x, grid.shape)).astype(float)
 
@@ -235,9 +271,7 @@ def _filtered(a: Projector, y: np.ndarray) -> np.ndarray | None:
 
 def _misfit(beam: ParallelBeam | ConeBeam, grid: VoxelGrid, y: np.ndarray, mask: np.ndarray, judges: np.ndarray) -> np.ndarray:
     """(judging views,) mean squared residual, by a volume that begins anew."""
-    x = None
-    for _ in range(3):
-        x, predicted = _predict(beam, grid, y, mask, judges, x)
+    _, predicted = _predict(beam, grid, y, mask, judges, None, SETTLED)
     squares = mask[judges] * (y - predicted)[judges] ** 2
     return squares.sum((1, 2)) / np.maximum(mask[judges].sum((1, 2)), 1.0)
 
@@ -250,55 +284,64 @@ def _slopes(predicted: np.ndarray) -> np.ndarray:
     return np.stack([along_v, along_u, along_v * columns - along_u * rows[:, None]], -1)
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """A Gauss-Newton step: normal equations of the views, of the common unknowns, and the gradients of each view."""
+def _move_views(
+    predicted: np.ndarray, residual: np.ndarray, mask: np.ndarray, angles: np.ndarray, own: list[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """A Gauss-Newton step (views, 3) of the moves ``own``, and its normal equations (views, own moves, own moves)."""
+    j, moves = _slopes(predicted)[..., own], np.zeros((len(residual), 3))
+    normal = np.einsum("vrci,vrc,vrcj->vij", j, mask, j)
+    # A view without slopes stays where it is.
+    normal += 1e-6 * np.trace(normal, axis1=1, axis2=2).mean() * np.eye(len(own)) / len(own) + 1e-30 * np.eye(len(own))
+    pull = np.einsum("vrci,vrc,vrc->vi", j, mask, residual)
+    moves[:, own] = np.clip(np.linalg.solve(normal, pull[..., None])[..., 0], -LARGEST_STEP, LARGEST_STEP)
+    return _fix_gauge(moves, angles), normal
 
-    own: np.ndarray
-    common: np.ndarray
-    gradients: np.ndarray
 
-
-def _improve(
+def _move_axis(
     state: _State,
     beam: ParallelBeam | ConeBeam,
     grid: VoxelGrid,
-    x: np.ndarray,
-    residual: np.ndarray,
+    y: np.ndarray,
     mask: np.ndarray,
-    predicted: np.ndarray,
-    own: list[int],
     common: list[int],
-) -> tuple[_State, np.ndarray, _Fit]:
-    """The unknowns after a step, the step (views x moves, then the common unknowns), and its equations."""
-    slopes = _slopes(predicted)
-    moves, shared = np.zeros((len(residual), 3)), np.zeros(3)
-    fit = _Fit(np.empty(0), np.empty(0), np.empty(0))
-    if own:
-        j = slopes[..., own]
-        normal = np.einsum("vrci,vrc,vrcj->vij", j, mask, j)
-        # A view without slopes stays where it is.
-        normal += 1e-6 * np.trace(normal, axis1=1, axis2=2).mean() * np.eye(len(own)) / len(own) + 1e-30 * np.eye(len(own))
-        pull = np.einsum("vrci,vrc,vrc->vi", j, mask, residual)
-        moves[:, own] = np.clip(np.linalg.solve(normal, pull[..., None])[..., 0], -LARGEST_STEP, LARGEST_STEP)
-        moves = _fix_gauge(moves, beam.angles)
-        fit = replace(fit, own=normal)
-    if common:
-        parts = {0: slopes[..., 1], 2: slopes[..., 2]}
-        if 1 in common:
-            ends = [
-                Projector(replace(state.beam(beam), tilt=state.beam(beam).tilt + h), grid) @ np.reshape(x, grid.shape)
-                for h in (-TILT_STEP, TILT_STEP)
-            ]
-            parts[1] = (ends[1].astype(float) - ends[0]) / (2 * TILT_STEP)
-        j = np.stack([parts[k] for k in common], -1)
-        normal = np.einsum("vrci,vrc,vrcj->ij", j, mask, j)
-        gradients = np.einsum("vrci,vrc,vrc->vi", j, mask, residual)
-        limit = np.array([LARGEST_STEP, 0.05, 0.05])[common]
-        shared[common] = np.clip(np.linalg.lstsq(normal, gradients.sum(0), rcond=1e-9)[0], -limit, limit)
-        fit = replace(fit, common=normal, gradients=gradients)
-    step = np.concatenate([moves.ravel(), shared])
-    return _State(state.moves + moves, state.common + shared), step, fit
+    slopes: np.ndarray | None,
+    is_last: bool,
+) -> tuple[_State, np.ndarray, np.ndarray]:
+    """The state after a step of axis and tilt on every fourth view, predicted by the others.
+
+    ``slopes`` are those of an earlier round, or None: find them. Returned after the state: the slopes
+    (judging views, rows, cols, common), and the standard deviations (3,), 0 for what is known.
+    """
+    judges = np.arange(FOLD // 2, len(y), FOLD)
+
+    def predict(common: np.ndarray, iterations: int, noise: np.ndarray | float = 0.0) -> np.ndarray:
+        at = replace(state, common=common)
+        return _predict(at.beam(beam), grid, y + noise, mask, judges, None, iterations)[1][judges]
+
+    if slopes is None:
+        moved = [COMMON_STEPS * (np.arange(3) == k) for k in common]
+        ends = [(predict(state.common + h, ITERATIONS), predict(state.common - h, ITERATIONS)) for h in moved]
+        slopes = np.stack([(up - down) / (2 * h.sum()) for (up, down), h in zip(ends, moved, strict=True)], -1)
+    predicted, seen = predict(state.common, SETTLED), mask[judges]
+    residual = y[judges] - predicted
+    normal = np.einsum("vrci,vrc,vrcj->vij", slopes, seen, slopes)
+    pull = np.einsum("vrci,vrc,vrc->vi", slopes, seen, residual)
+    inverse = np.linalg.pinv(normal.sum(0), rcond=1e-9)
+    step = inverse @ pull.sum(0)
+    rest = pull - normal @ step
+    covariance = inverse @ (rest.T @ rest) @ inverse
+    if is_last:
+        rng, variance = np.random.default_rng(0), float((seen * residual**2).sum() / seen.sum() / _smooth_variance(seen.shape))
+        for _ in range(REPEATS):
+            noise = math.sqrt(variance) * _smooth(rng.standard_normal(y.shape))
+            change = predict(state.common, SETTLED, noise) - predicted
+            by_volume = inverse @ np.einsum("vrci,vrc,vrc->i", slopes, seen, change)
+            covariance += np.outer(by_volume, by_volume) / REPEATS
+    moved_by, sigma = np.zeros(3), np.zeros(3)
+    moved_by[common] = np.clip(step, -LARGEST_COMMON[common], LARGEST_COMMON[common])
+    # The last step bounds what further rounds would add.
+    sigma[common] = np.hypot(np.sqrt(np.diag(covariance)), step)
+    return replace(state, common=state.common + moved_by), slopes, sigma
 
 
 def _fix_gauge(moves: np.ndarray, angles: np.ndarray) -> np.ndarray:
@@ -318,40 +361,18 @@ def _moves_spread(slopes: np.ndarray, mask: np.ndarray, normal: np.ndarray) -> n
         mask: (views, rows, cols), 1 where readings count.
         normal: N (views, own moves, own moves).
     """
-    middle = (mask.shape[1] // 2, mask.shape[2] // 2)
-    point = np.zeros((1, *mask.shape[1:]))
-    point[0, *middle] = 1.0
-    reduction = float((_smooth(point) ** 2).sum())
     smooth = np.stack([_smooth(mask * part) for part in np.moveaxis(slopes, -1, 0)], -1)
     inverse = np.linalg.inv(normal)
-    covariance = inverse @ np.einsum("vrci,vrcj->vij", smooth, smooth) @ inverse / reduction
+    covariance = inverse @ np.einsum("vrci,vrcj->vij", smooth, smooth) @ inverse / _smooth_variance(mask.shape)
     return np.median(np.diagonal(covariance, axis1=1, axis2=2), axis=0)
 
 
-def _deviations(
-    fit: _Fit, variances: np.ndarray, steps: list[np.ndarray], own: list[int], common: list[int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviations of the moves (3,) and of the common unknowns (3,); 0 for those that are known.
+def _deviations(variances: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Standard deviations of the moves (own moves,), from their variances by noise and the steps (rounds, views, own moves).
 
     Of the curvature of a fixed volume, the share ``c`` = 1 - (last step over the step before) remains. The rounds that were
-    not taken would add ``step (1 - c) / c``. ``variances`` are those of the moves due to noise.
+    not taken would add ``step (1 - c) / c``.
     """
-    views = (len(steps[-1]) - 3) // 3
-
-    def remaining(parts: list[np.ndarray]) -> tuple[float, float]:
-        last, before = (float(np.sqrt(np.mean(part**2))) for part in (parts[-1], parts[-2]))
-        ratio = min(last / before, 0.95) if before > 0 else 0.0
-        return 1 - ratio, last * ratio / (1 - ratio)
-
-    sigma, shared = np.zeros(3), np.zeros(3)
-    for k, axis in enumerate(own):
-        _, rest = remaining([step[: 3 * views].reshape(views, 3)[:, axis] for step in steps])
-        sigma[axis] = math.hypot(math.sqrt(variances[k]), rest)
-    if common:
-        inverse = np.linalg.pinv(fit.common)
-        scatter = (fit.gradients - fit.gradients.mean(0)).T @ (fit.gradients - fit.gradients.mean(0))
-        covariance = inverse @ scatter @ inverse
-        for k, axis in enumerate(common):
-            share, rest = remaining([step[3 * views + axis : 3 * views + axis + 1] for step in steps])
-            shared[axis] = math.hypot(math.sqrt(covariance[k, k]) / share, rest)
-    return sigma, shared
+    before, last = np.sqrt(np.mean(steps[-2:] ** 2, axis=1))
+    ratio = np.minimum(np.divide(last, before, out=np.zeros_like(last), where=before > 0), 0.95)
+    return np.hypot(np.sqrt(variances), last * ratio / (1 - ratio))
