@@ -3,7 +3,8 @@
 A slab needs the detector rows onto which it projects. In parallel light these are its own rows; in a cone beam neighbouring
 slabs share rows. Filtered back-projection treats each row and each layer separately, so slabs equal the whole volume to
 rounding. An iterative solver solves each slab of a parallel beam by itself. If layers lie between rows, or a prior compares
-neighbouring layers, slabs overlap by ``OVERLAP`` layers, which are dropped.
+neighbouring layers, slabs overlap by ``OVERLAP`` layers, which are dropped. In a cone beam, ``sirt`` and ``os-sart`` sweep over
+the whole volume on the disk first (:class:`DiskSweeps`), and the slabs are then copied from it.
 
 Conventions. The run folder has ``preview.png`` and ``volumes/preview.npz`` first, then slices in ``volumes/slices`` or
 ``volumes/reconstruction.zarr``. ``slabs.json`` lists the finished slabs; a resumed run continues after them.
@@ -14,8 +15,9 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +47,7 @@ from mivol.files.atomic import write_whole_text
 from mivol.files.tiff import TiffSlices
 from mivol.files.zarr import ZarrSlices
 from mivol.machine import peak_memory
+from mivol.optim.projections.disk_sweeps import DiskSweeps, SweepState
 from mivol.optim.projections.linear_problems import last_state
 from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.report.page import write_page
@@ -73,6 +76,12 @@ BASE_BYTES = 350 << 20
 RAY_BYTES, VOXEL_BYTES = {"direct": 60, "iterative": 160}, {"direct": 12, "iterative": 60}
 """Memory per ray and per unknown of a slab [byte]. ``mivol bench scan_size --only whole`` prints the peak beside the planned
 memory, with ``--solver pcg`` that of an iterative solver."""
+
+SWEEPS = "volumes/sweeps"
+"""Folder of volume and projections during sweeps; removed in the end."""
+
+SWEPT = ("sirt", "os-sart")
+"""Solvers whose iterations sweep over a volume on the disk: they need no other vectors of its size from one to the next."""
 
 PREVIEW_STEP, PREVIEW_UPDATES = 8, 1 << 34
 """Layers between two slices of the preview, and most readings of pixels by voxels: about ten seconds on two cores."""
@@ -193,21 +202,19 @@ def plan_slabs(settings: config.ScanExperiment, base: Path) -> SlabPlan:
     """Choose solver and slabs.
 
     Raises:
-        MivolError: as :func:`open_source`, a memory below that of a single layer, or an iterative solver of a cone beam.
+        MivolError: as :func:`open_source`, a memory below that of a single layer, or another iterative solver of a cone beam.
     """
     source = open_source(settings, base)
     has_grid = settings.grid is not None or isinstance(settings.scan, config.OfData)
     grid = make_grid(settings, base) if has_grid else grid_of_detector(source.beam)
     walk = Projector(source.beam, grid)
     solve, choices = _resolve(settings.solve, source.beam, walk)
-    if solve.name not in DIRECT and isinstance(source.beam, ConeBeam):
-        raise MivolError(
-            f"found {solve.name} for slabs of a cone beam, expected fdk: rays cross slabs, so an iteration needs the whole "
-            "volume several times; choose fdk, or leave out [slabs] and give grid.shape fewer voxels."
-        )
+    if isinstance(source.beam, ConeBeam):
+        _check_cone_solver(solve)
     if solve.name in DIRECT and settings.solve.tv:
         raise MivolError(f"{solve.name} takes no solve.tv: choose pcg, or leave it out.")
-    overlap = 0 if solve.name in DIRECT or (not solve.tv and _are_layers_rows(source.beam, grid)) else OVERLAP
+    is_local = solve.name in DIRECT or isinstance(source.beam, ConeBeam)
+    overlap = 0 if is_local or (not solve.tv and _are_layers_rows(source.beam, grid)) else OVERLAP
     settings = msgspec.structs.replace(settings, solve=solve)
     count = _most_layers(settings, source.beam, grid, overlap)
     layers = tuple(slice(first, min(first + count, grid.shape[0])) for first in range(0, grid.shape[0], count))
@@ -221,6 +228,20 @@ def plan_slabs(settings: config.ScanExperiment, base: Path) -> SlabPlan:
     return SlabPlan(source, grid, settings, layers, overlap, tuple(choices))
 
 
+def _check_cone_solver(solve: config.SolveSettings) -> None:
+    """Refuse solvers whose vectors do not fit, and unknowns that are not the voxels."""
+    if solve.name not in (*DIRECT, *SWEPT):
+        raise MivolError(
+            f"found {solve.name} for slabs of a cone beam, expected fdk, sirt or os-sart: rays cross slabs, and {solve.name} "
+            "keeps several vectors of the volume's size; choose os-sart, or leave out [slabs] and give grid.shape fewer voxels."
+        )
+    if solve.name in SWEPT and (solve.tv or solve.supersampling != 1):
+        raise MivolError(
+            f"found solve.tv = {solve.tv:g} and solve.supersampling = {solve.supersampling} for slabs of a cone beam by "
+            f"{solve.name}, expected 0 and 1: leave them out."
+        )
+
+
 def _resolve(
     solve: config.SolveSettings, beam: ParallelBeam | ConeBeam, walk: Projector
 ) -> tuple[config.SolveSettings, list[PlanLine]]:
@@ -229,7 +250,8 @@ def _resolve(
         try:
             check_directions(walk)
         except MivolError:
-            return resolve_solver(solve, walk)
+            swept = isinstance(beam, ConeBeam)
+            return resolve_solver(msgspec.structs.replace(solve, name="os-sart") if swept else solve, walk)
         name = "fbp" if isinstance(beam, ParallelBeam) else "fdk"
         found = msgspec.structs.replace(solve, name=name, start="empty", supersampling=1, tv=solve.tv or 0.0)
         return found, [PlanLine(choice=f"solver: {name}", reason="slabs are done in a single step; solve.name sets another")]
@@ -273,6 +295,8 @@ def _slab_bytes(
     """Memory of the largest of some slabs [byte]."""
     kind = "direct" if settings.solve.name in DIRECT else "iterative"
     views, _, columns = beam.shape
+    if settings.solve.name in SWEPT and isinstance(beam, ConeBeam):
+        views = _views_at_once(settings, beam)
     most = 0.0
     for part in layers:
         wide = _widen(part, overlap, grid.shape[0])
@@ -284,14 +308,32 @@ def _slab_bytes(
     return BASE_BYTES + most
 
 
+def _views_at_once(settings: config.ScanExperiment, beam: ConeBeam) -> int:
+    """Views of a product during sweeps: their rays take a third of the memory."""
+    views, rows, columns = beam.shape
+    budget = (settings.slabs.memory * 2**30 - BASE_BYTES) / 3
+    return min(views, max(1, int(budget / (RAY_BYTES["iterative"] * rows * columns))))
+
+
 def _widen(layers: slice, overlap: int, total: int) -> slice:
     return slice(max(0, layers.start - overlap), min(total, layers.stop + overlap))
 
 
 def rows_of_slab(beam: ParallelBeam | ConeBeam, slab: VoxelGrid) -> slice:
     """Return the rows of the detector between which the voxel centres of a slab cast their shadows, upwards; may be empty."""
+    return _shadowed_rows(beam, slab, 0.0)
+
+
+def rows_of_box(beam: ParallelBeam | ConeBeam, slab: VoxelGrid) -> slice:
+    """Return the rows whose rays cross the box of a slab, as :func:`rows_of_slab`."""
+    return _shadowed_rows(beam, slab, 0.5)
+
+
+def _shadowed_rows(beam: ParallelBeam | ConeBeam, slab: VoxelGrid, margin: float) -> slice:
+    """Rows between the shadows of the outermost voxel centres, each ``margin`` voxels further out."""
     matrices = pixel_matrices(beam, slab)
-    corners = np.array(list(itertools.product(*((0, n - 1) for n in slab.shape[::-1]), (1,))), float)
+    ends = ((-margin, n - 1 + margin) for n in slab.shape[::-1])
+    corners = np.array(list(itertools.product(*ends, (1,))), float)
     row, depth = matrices[:, 1] @ corners.T, matrices[:, 2] @ corners.T
     rows = beam.shape[1]
     if not (depth > 0).all():
@@ -345,10 +387,12 @@ def run_slabs(context: RunContext) -> Path:
             caption = _write_preview(plan, preview_rows(plan), run.path)
             record.images.append(Image(path=PREVIEW, role="picture", caption=caption))
             context.progress.say([f"{run.path / PREVIEW}: {caption}"])
+        solved = _sweep(plan, state, run, context) if _is_swept(plan) else None
         with run.stage("slabs"):
             writer = _open_writer(plan, run)
             for layers in context.progress.track(plan.layers, "slabs"):
-                _complete_slab(plan, layers, writer, state, run.path)
+                _complete_slab(plan, layers, writer, state, run.path, solved)
+        shutil.rmtree(run.path / SWEEPS, ignore_errors=True)
         record.results |= _results(plan, state)
         record.notes.append(
             f"the volume is {writer.path.relative_to(run.path)}, {' x '.join(map(str, plan.grid.shape))} voxels"
@@ -378,30 +422,108 @@ def explain_slabs(settings: config.ScanExperiment, base: Path, say: Say) -> Expl
     return Explanation((f"  solver    {plan.settings.solve.name}, slab by slab",))
 
 
-def _complete_slab(plan: SlabPlan, layers: slice, writer: TiffSlices | ZarrSlices, state: dict[str, Any], folder: Path) -> None:
-    """Reconstruct and write a slab, unless it is finished."""
+def _is_swept(plan: SlabPlan) -> bool:
+    return plan.settings.solve.name in SWEPT and isinstance(plan.source.beam, ConeBeam)
+
+
+def make_sweeps(plan: SlabPlan, folder: Path) -> DiskSweeps:
+    """Return the sweeps of a cone beam's iterative solver over the files of a folder."""
+    solve, views = plan.settings.solve, plan.source.beam.shape[0]
+    options: dict[str, Any] = {"relaxation": solve.relaxation} if solve.name == "os-sart" else {}
+    if solve.name == "os-sart":
+        options |= {"n_subsets": min(solve.subsets, views), "decay": solve.decay}
+    return DiskSweeps(
+        plan.source.beam,
+        plan.grid,
+        plan.layers,
+        lambda slab: rows_of_box(plan.source.beam, slab),
+        _views_at_once(plan.settings, plan.source.beam),
+        folder,
+        nonnegative=solve.nonnegative,
+        **options,
+    )
+
+
+def prepare_sweeps(plan: SlabPlan, sweeps: DiskSweeps) -> SweepState:
+    """Write line integrals and the first volume of sweeps."""
+
+    def read(rows: slice) -> np.ndarray:
+        data = plan.source.read(rows)
+        return np.where(data.weights > 0, data.y, np.nan)
+
+    def filtered(layers: slice) -> np.ndarray:
+        volume = _backproject_slab(plan, layers, config.SolveSettings(name="fdk"))
+        return np.maximum(volume, 0) if sweeps.nonnegative else volume
+
+    return sweeps.prepare(read, filtered if plan.settings.solve.start == "filtered" else None)
+
+
+def _sweep(plan: SlabPlan, state: dict[str, Any], run: RunFolder, context: RunContext) -> np.ndarray | None:
+    """The volume after all sweeps, read from the disk; None if all slabs are written."""
+    if len(state["done"]) == len(plan.layers):
+        return None
+    run.make(SWEEPS)
+    sweeps = make_sweeps(plan, run.path / SWEEPS)
+    with run.stage("sweeps"):
+        if "sweeps" in state:
+            at = SweepState(**state["sweeps"])
+        else:
+            at = prepare_sweeps(plan, sweeps)
+            _keep(state, at, run.path)
+        total = plan.settings.solve.iterations * sweeps.n_subsets
+        states = sweeps.run(at)
+        for _ in context.progress.track(range(at.steps, total), "subsets"):
+            at = next(states)
+            _keep(state, at, run.path)
+    norms = ", ".join(f"{value:.4g}" for value in (at.residuals[0], at.residuals[-1]))
+    context.progress.say([f"{len(at.residuals)} sweeps over the volume; residual of the first and the last: {norms}"])
+    return sweeps.volume(at)
+
+
+def _keep(state: dict[str, Any], at: SweepState, folder: Path) -> None:
+    state["sweeps"] = asdict(at)
+    write_whole_text(folder / STATE, json.dumps(state))
+
+
+def _complete_slab(
+    plan: SlabPlan,
+    layers: slice,
+    writer: TiffSlices | ZarrSlices,
+    state: dict[str, Any],
+    folder: Path,
+    solved: np.ndarray | None,
+) -> None:
+    """Reconstruct a slab, or take it from the solved volume, and write it, unless it is finished."""
     key = f"{layers.start}-{layers.stop}"
     if key in state["done"]:
         return
-    volume = reconstruct_slab(plan, layers)
+    volume = reconstruct_slab(plan, layers) if solved is None else np.array(solved[layers])
     writer.write(layers.start, volume)
     state["done"][key] = _compare(plan, layers, volume)
     write_whole_text(folder / STATE, json.dumps(state))
 
 
 def reconstruct_slab(plan: SlabPlan, layers: slice) -> np.ndarray:
-    """Return some layers (layers, Y, X) of the volume."""
+    """Return some layers (layers, Y, X) of the volume, by a solver that takes each slab by itself."""
+    if plan.settings.solve.name in DIRECT:
+        return _backproject_slab(plan, layers, plan.settings.solve)
     wide = _widen(layers, plan.overlap, plan.grid.shape[0])
     slab = plan.grid.select_layers(wide)
     rows = rows_of_slab(plan.source.beam, slab)
     if rows.start == rows.stop:
         return np.zeros((layers.stop - layers.start, *slab.shape[1:]), np.float32)
-    data, solve = plan.source.read(rows), plan.settings.solve
-    if solve.name in DIRECT:
-        volume = _reconstruct_directly(Projector(data.geometry, slab), interpolate_gaps(data.y, data.weights), solve)
-    else:
-        volume = _iterate(plan.settings, data, slab)
+    volume = _iterate(plan.settings, plan.source.read(rows), slab)
     return volume[layers.start - wide.start :][: layers.stop - layers.start]
+
+
+def _backproject_slab(plan: SlabPlan, layers: slice, solve: config.SolveSettings) -> np.ndarray:
+    """Some layers (layers, Y, X) by filtered back-projection; 0 beyond the detector's rows."""
+    slab = plan.grid.select_layers(layers)
+    rows = rows_of_slab(plan.source.beam, slab)
+    if rows.start == rows.stop:
+        return np.zeros(slab.shape, np.float32)
+    data = plan.source.read(rows)
+    return _reconstruct_directly(Projector(data.geometry, slab), interpolate_gaps(data.y, data.weights), solve)
 
 
 def _reconstruct_directly(projector: Projector, y: np.ndarray, solve: config.SolveSettings, cutoff: float = 1.0) -> np.ndarray:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -15,11 +17,15 @@ from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.experiments import slab_scan
 from mivol.experiments.projections import Projections
-from mivol.experiments.slab_scan import plan_slabs, reconstruct_slab, rows_of_slab
+from mivol.experiments.slab_scan import SlabPlan, plan_slabs, reconstruct_slab, rows_of_slab
 from mivol.files import read_volume, write_volume
 from mivol.files.image_stack import read_stack, stack_shape
+from mivol.optim.projections.disk_sweeps import DiskSweeps
+from mivol.optim.projections.linear_problems import LeastSquares
+from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import shepp_logan
+from mivol.tomography.projector import Projector
 
 SCAN = """title = "slabs"
 threads = 1
@@ -54,6 +60,89 @@ def test_slabs_equal_the_whole_to_rounding(variant_rgb: str, tmp_path: Path, nam
     assert np.abs(np.concatenate(parts) - whole).max() < 2e-5 * whole.max()
     truth = plan.source.truth(plan.grid)
     assert np.linalg.norm(whole - truth) < 0.75 * np.linalg.norm(truth)
+
+
+def sweep_cone(folder: Path, solver: str, monkeypatch: pytest.MonkeyPatch, layers: int = 7) -> tuple[SlabPlan, DiskSweeps]:
+    """A cone beam of 19 layers whose object and box leave the detector above and below; seven views a product."""
+    text = SCAN + CONE.replace("[30, 24]", "[14, 24]") + BETWEEN
+    (folder / "fit.toml").write_text(text + f'solve = {{ name = "{solver}", subsets = 3, iterations = 3, relaxation = 0.8 }}\n')
+    monkeypatch.setattr(slab_scan, "_most_layers", lambda *_: layers)
+    monkeypatch.setattr(slab_scan, "_views_at_once", lambda *_: 7)
+    plan = plan_slabs(config.load(folder / "fit.toml", []), folder)
+    return plan, slab_scan.make_sweeps(plan, folder)
+
+
+@pytest.mark.parametrize(("solver", "start"), [("sirt", "empty"), ("os-sart", "filtered")])
+def test_sweeps_over_the_disk_equal_those_in_memory(
+    variant_rgb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, solver: str, start: str
+) -> None:
+    """Three slabs of a cone beam, some unused rays: volume and residuals of the solver in memory, to float32 sums in another
+    order (2e-5 of the largest value)."""
+    plan, sweeps = sweep_cone(tmp_path, solver, monkeypatch)
+    assert len(plan.layers) == 3 and plan.overlap == 0
+    settings = msgspec.structs.replace(plan.settings, solve=msgspec.structs.replace(plan.settings.solve, start=start))
+    whole = plan.source.read(slice(0, 14))
+    weights = np.where(np.random.default_rng(1).random(whole.y.shape) < 0.1, 0.0, whole.weights)
+    read = plan.source.read
+    source = replace(plan.source, read=lambda rows: replace(read(rows), weights=weights[:, rows]))
+    plan = replace(plan, settings=settings, source=source)
+    begin = slab_scan.prepare_sweeps(plan, sweeps)
+    x0 = sweeps.volume(begin).copy()
+    assert bool(x0.any()) == (start == "filtered")
+    state = list(itertools.islice(sweeps.run(begin), 3 * sweeps.n_subsets))[-1]
+    a = Projector(plan.source.beam, plan.grid)
+    options = {} if solver == "sirt" else {"n_subsets": 3, "decay": 0.99}
+    problem = LeastSquares(a, whole.y, weights, x0, nonnegative=True)
+    relaxation = 1.0 if solver == "sirt" else 0.8
+    expected = list(itertools.islice(SOLVERS[solver].run(problem, relaxation=relaxation, **options), 3))
+    x = expected[-1].x.reshape(plan.grid.shape)
+    assert np.abs(sweeps.volume(state) - x).max() < 2e-5 * x.max()
+    np.testing.assert_allclose(state.residuals, [one.residual_norm for one in expected], rtol=1e-5)
+
+
+def test_sweeps_go_on_after_a_stop(variant_rgb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C within the fifth of nine subsets, after the first slab was updated: --resume gives the volume of an undisturbed
+    run bit by bit, and the files of the sweeps are gone."""
+    sweep_cone(tmp_path, "os-sart", monkeypatch)
+    command = ["optimize", str(tmp_path / "fit.toml"), "-o"]
+    assert main([*command, str(tmp_path / "whole")]) == 0
+    update, calls = DiskSweeps._update, []
+
+    def stop(*given: object) -> None:
+        calls.append(1)
+        if len(calls) == 14:
+            raise KeyboardInterrupt
+        update(*given)
+
+    monkeypatch.setattr(DiskSweeps, "_update", stop)
+    assert main([*command, str(tmp_path / "run")]) == 130
+    state = json.loads((tmp_path / "run" / slab_scan.STATE).read_text())
+    assert state["sweeps"]["steps"] == 4 and not state["done"]
+    assert main([*command, str(tmp_path / "run"), "--resume"]) == 0
+    assert len(calls) == 14 + 3 * 5
+    volumes = [read_volume(tmp_path / name / "volumes/slices").values for name in ("whole", "run")]
+    np.testing.assert_array_equal(*volumes)
+    assert volumes[0].max() > 0.5 and not (tmp_path / "run" / slab_scan.SWEEPS).exists()
+    assert main([*command, str(tmp_path / "run"), "--resume"]) == 0 and len(calls) == 14 + 3 * 5
+
+
+def test_a_short_arc_of_a_cone_is_swept(variant_rgb: str, tmp_path: Path) -> None:
+    """Filtered back-projection refuses 100 degrees, so auto is os-sart."""
+    (tmp_path / "fit.toml").write_text(SCAN + CONE + ROWS)
+    plan = plan_slabs(config.load(tmp_path / "fit.toml", ["scan.arc=100"]), tmp_path)
+    assert plan.settings.solve.name == "os-sart"
+
+
+def test_sweeps_within_the_memory(variant_rgb: str, tmp_path: Path) -> None:
+    """1024^3 voxels from 1024 cone views of 1024^2 within 4 GiB: of what is above the base, a third holds
+    the rays of seven views, and two thirds hold 41 layers and more."""
+    scan = CONE.replace("views = 40", "views = 1024").replace("[30, 24]", "[1024, 1024]").replace("0.11", "0.0025")
+    text = SCAN + scan + 'grid = { shape = [1024, 1024, 1024], voxel_size = 0.002 }\nsolve = { name = "os-sart" }\n'
+    (tmp_path / "fit.toml").write_text(text)
+    plan = plan_slabs(config.load(tmp_path / "fit.toml", ["slabs.memory=4"]), tmp_path)
+    above = 4 * 2**30 - slab_scan.BASE_BYTES
+    views = slab_scan._views_at_once(plan.settings, plan.source.beam)
+    assert views == int(above / 3 / (160 * 2**20)) == 7 and 41 <= plan.layers[0].stop <= 62
 
 
 def test_a_slab_reads_the_rows_that_it_needs() -> None:
@@ -209,12 +298,13 @@ def test_memory_bounds_the_slabs(variant_rgb: str, tmp_path: Path) -> None:
     ("changes", "found"),
     [
         (
-            ["solve.name=sirt"],
-            "found sirt for slabs of a cone beam, expected fdk: rays cross slabs.*give grid.shape fewer voxels",
+            ["solve.name=pcg"],
+            "found pcg for slabs of a cone beam, expected fdk, sirt or os-sart: rays cross slabs.*give grid.shape fewer voxels",
         ),
         (["solve.name=ml-tr"], "slabs take neither ml-tr nor data.drift"),
         (["data.source=volume", "data.file=a.npy"], 'found data.source = "volume"'),
-        (["scan.arc=100"], "found pcg for slabs of a cone beam"),
+        (["solve.name=sirt", "solve.tv=1"], "found solve.tv = 1 and solve.supersampling = 1 for slabs of a cone beam by sirt"),
+        (["solve.name=os-sart", "solve.supersampling=2"], "found solve.tv = 0 and solve.supersampling = 2"),
         (["solve.name=fdk", "solve.tv=1"], "fdk takes no solve.tv"),
     ],
 )

@@ -118,7 +118,7 @@ class _Block:
 def _blocks(problem: LeastSquares, n_subsets: int) -> list[_Block]:
     a = problem.A
     chord = ray_lengths(a)
-    views = [None] if n_subsets == 1 else [np.arange(s, a.n_views, n_subsets) for s in _golden_order(n_subsets)]
+    views = [None] if n_subsets == 1 else [np.arange(s, a.n_views, n_subsets) for s in golden_order(n_subsets)]
     return [_block(problem, v, chord) for v in views]
 
 
@@ -134,7 +134,7 @@ def _block(problem: LeastSquares, views: np.ndarray | None, chord: np.ndarray) -
     return _Block(a, part(problem.b), used, per_ray, reciprocal(a.T @ used))
 
 
-def _golden_order(n: int) -> np.ndarray:
+def golden_order(n: int) -> np.ndarray:
     """A permutation of 0..n-1 with distant neighbours."""
     return np.argsort(np.argsort(np.arange(n) * (np.sqrt(5) - 1) / 2 % 1.0))
 
