@@ -122,6 +122,60 @@ def test_what_is_not_traced_again_is_the_same(fact: str, monkeypatch: pytest.Mon
         np.testing.assert_allclose(short, traced, rtol=0, atol=1e3 * 2.0**-24 * np.abs(traced).max())
 
 
+# -- Glass in view ---------------------------------------------------------------------------------------------------------
+
+THIN = {"type": "thindielectric"}
+RADIANCE = 10.0
+
+
+def pane(bsdf: dict, **lights: dict) -> mi.Scene:
+    """A pane of glass that turns the view by 90 degrees where it reflects, and a fog out of view."""
+    place = mi.ScalarTransform4f().rotate([1, 0, 0], -45)
+    eye = scenes.camera((0.0, 0.0, 6.0), (0.0, 0.0, 0.0), res=64, fov=0.1)
+    fog = ball(20.0, bsdf=NONE, interior={"type": "homogeneous"})
+    return mi.load_dict(
+        {"type": "scene", "pane": {"type": "rectangle", "to_world": place, "bsdf": bsdf}, "fog": fog, "sensor": eye, **lights}
+    )
+
+
+def reflectance(bsdf: dict) -> float:
+    """Of glass at 45 degrees; a thin pane reflects between its two faces too."""
+    eta = 1.5046 / 1.000277
+    inside = np.sqrt(1 - 0.5 / eta**2) * np.sqrt(2)  # cosines by Snell's law, over cos 45
+    amplitudes = np.array([(1 - eta * inside) / (1 + eta * inside), (eta - inside) / (eta + inside)])
+    once = np.mean(amplitudes**2)
+    return once if bsdf is GLASS else 2 * once / (1 + once)
+
+
+@pytest.mark.parametrize("bsdf", [GLASS, THIN], ids=["dielectric", "thin"])
+@pytest.mark.parametrize("depth", [2, 4])
+def test_glass_in_view_reflects_more_samples_than_light(bsdf: dict, depth: int) -> None:
+    """The share sqrt(R) / (sqrt(R) + sqrt(1 - R)) of the samples finds the lamp, and all together find R times its light."""
+    R = reflectance(bsdf)
+    share = R**0.5 / (R**0.5 + (1 - R) ** 0.5)
+    above = mi.ScalarTransform4f().translate([0, 5, 0]).rotate([1, 0, 0], 90).scale(3)
+    lamp = {"type": "rectangle", "to_world": above, "emitter": {"type": "area", "radiance": RADIANCE}}
+    light = scenes.render(pane(bsdf, lamp=lamp), {"type": "mivol", "max_depth": depth}, 1, seed=3)[..., 0].ravel()
+    # R varies by 2e-3 of itself over the picture.
+    np.testing.assert_allclose(light[light > 0], RADIANCE * R / share, rtol=5e-3)
+    assert abs((light > 0).mean() - share) < 5 * (share * (1 - share) / light.size) ** 0.5
+
+
+def test_glass_in_even_light_adds_no_noise() -> None:
+    """Both directions see 1, and R + (1 - R) = 1 needs no weights."""
+    light = scenes.render(pane(THIN, sky=scenes.sky()), {"type": "mivol", "max_depth": 4}, 1, seed=3)[..., :3]
+    np.testing.assert_allclose(light, 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "found"), [(GLASS, True), (THIN, True), (ROUGH, False), ({"type": "mask", "opacity": 0.5, "bsdf": THIN}, False)]
+)
+def test_glass_is_what_has_two_directions(bsdf: dict, found: bool) -> None:
+    """What may also let a ray pass has three; where it stands beside glass, a lane could not tell one from the other."""
+    assert survey_scene(pane(bsdf)).facts.has_glass == found
+    assert survey_scene(pane(GLASS, more=ball(3.0, bsdf=bsdf))).facts.has_glass == (found or bsdf is ROUGH)
+
+
 # -- Roulette of long paths ------------------------------------------------------------------------------------------------
 
 WAIT = 100
