@@ -229,9 +229,7 @@ class _EmitterTable:
         return x, y, z, r, finite > 0
 
 
-def eval_direction(
-    emitter: mi.EmitterPtr, it: mi.Interaction3f, direct: mi.DirectionSample3f, active: mi.Bool
-) -> mi.Color3f:
+def eval_direction(emitter: mi.EmitterPtr, it: mi.Interaction3f, direct: mi.DirectionSample3f, active: mi.Bool) -> mi.Color3f:
     """Radiance from the sampled place on an emitter towards a point [radiance]."""
     return dr.dispatch(emitter, _eval_implemented_direction, it, direct, active)
 
