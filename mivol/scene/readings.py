@@ -25,6 +25,7 @@ from mivol.transport.media.extinction import ExactExtinction, Extinction
 from mivol.transport.media.grid_extinction import GridExtinction
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.grid_blocks import (
+    SHIFT,
     BlockExtremes,
     BlockRanges,
     CoarseGrid,
@@ -80,6 +81,22 @@ def _read_once(survey: SceneSurvey, kind: tuple, array: mi.Float, make: Callable
     return survey.values[key][1]
 
 
+def _call_recorded(survey: SceneSurvey, function: Callable, *arguments: Any) -> Any:
+    """The result of a function of arrays, without tracing it in each step. A recording cannot hold another one."""
+    return function(*arguments) if is_recording() else survey.recorded.call(function, *arguments)
+
+
+def _find_ends(values: mi.TensorXf) -> tuple[list[mi.Float], list[mi.Float]]:
+    """The smallest and the largest values of :func:`find_extremes`."""
+    found = find_extremes(values)
+    return found.low, found.high
+
+
+def _find_distances(low: list[mi.Float], high: list[mi.Float], res: tuple[int, int, int]) -> mi.UInt32:
+    """The distances of :func:`find_distances_of_bounds` between the smallest and largest values of blocks."""
+    return find_distances_of_bounds(BlockExtremes(low, high, res, SHIFT).bounds, res)
+
+
 def release_unread(survey: SceneSurvey) -> None:
     """Release the arrays that neither the present nor the previous render has read: those of earlier steps of a fit."""
     survey.values = {key: kept for key, kept in survey.values.items() if any(key in reads for reads in survey.reads)}
@@ -114,7 +131,9 @@ def read_extinction(part: ExactExtinction, survey: SceneSurvey, name: str) -> Gr
             share = float(dr.count(blocks)[0]) / dr.width(blocks)
             return GridReading(blocks, share, float(dr.max(values.array)[0]), floored)
         # All facts of a dense grid follow from the extremes of its blocks, which the host reads once.
-        extremes = find_extremes(values)
+        # A recording would hold zeros for the derivatives of its inputs.
+        ends = _call_recorded(survey, _find_ends, dr.detach(values))
+        extremes = BlockExtremes(*ends, tuple(values.shape[:3]), SHIFT)
         low, high = (np.array([np.array(end) for end in ends]) for ends in (extremes.low, extremes.high))
         if activation is None and low.min() < 0:
             floored = _clip_negative(part, survey, name)
@@ -291,7 +310,8 @@ def read_empty_distances(part: ExactExtinction, survey: SceneSurvey, name: str) 
             return find_distances_of_bounds(reading.bounds, res)
         key = res, reading.pattern
         if place not in survey.distances or survey.distances[place][0] != key:
-            survey.distances[place] = key, find_distances_of_bounds(reading.bounds, res)
+            ends = reading.extremes.low, reading.extremes.high
+            survey.distances[place] = key, _call_recorded(survey, _find_distances, *ends, res)
         return survey.distances[place][1]
 
     return _read_once(survey, ("empty distances",), array, make)

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.kernel_recording import is_recording
+from mivol.kernel_recording import RecordedFunctions, is_recording
 from mivol.scene.nesting import OrientedBox, find_nesting_fault, oriented_box, scene_diagonal, shape_bounds
 from mivol.scene_graph import traverse
 from mivol.transport.estimators.lighting.emitters import UNIFORM_EMITTER
@@ -113,6 +113,7 @@ class SceneSurvey:
         values, numbers: results of reading arrays and constants (:mod:`mivol.scene.readings`).
         reads: keys of the values that the previous render and the present one have read.
         distances: distances of blocks to occupied blocks, with the pattern of these, by medium and part.
+        recorded: kernels that read grids.
         places: placements of grids (:func:`mivol.transport.media.medium_view.view_medium`).
         cosines: mean cosines of phase functions, by the name of the medium.
         warned: media and grids with a warning already given.
@@ -137,6 +138,7 @@ class SceneSurvey:
     values: dict = field(default_factory=dict)
     reads: list[set] = field(default_factory=lambda: [set(), set()])
     distances: dict = field(default_factory=dict)
+    recorded: RecordedFunctions = field(default_factory=RecordedFunctions)
     places: dict = field(default_factory=dict)
     numbers: dict = field(default_factory=dict)
     cosines: dict = field(default_factory=dict)

@@ -29,11 +29,12 @@ from mivol.kernel_recording import (
     is_recording,
     without_garbage_collection,
 )
-from mivol.scene import plan, render_tasks, scene_state, session
+from mivol.scene import plan, readings, render_tasks, scene_state, session
 from mivol.scene.scene_state import SceneState, find_hidden_arrays
 from mivol.scene.stand_in import FORMATS, StandIn, describe_kind
 from mivol.threads import set_thread_count
 from mivol.transport.path.film import RenderSamples, film_passes, find_batch_views
+from mivol.transport.traversal.grid_blocks import find_empty_distances
 from scenes import ball_of, box_of, camera, grid_volume, medium, pencil, refused, sky
 
 pytestmark = pytest.mark.usefixtures("cpu_back_end")
@@ -318,6 +319,26 @@ def test_a_replay_launches_few_kernels() -> None:
 
     # A changed grid is read again: its update, one kernel for the extremes of its blocks, and their table.
     assert count_launches(step) <= 81
+
+
+def test_a_changed_grid_is_read_without_tracing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The distances to occupied blocks are those of the grid of each step, and nothing is traced after the first step."""
+    pair, traced = Pair(smoke_under(), 2), []
+    find = readings.find_extremes
+    monkeypatch.setattr(readings, "find_extremes", lambda *given: traced.append(1) or find(*given))
+    shape = pair.params[INSIDE + "sigma_t.data"].shape
+    for k, corner in enumerate(((0, 0, 0), (0, 0, -1), (0, -1, 0))):
+        grid = np.zeros(shape, np.float32)
+        grid[corner] = 2.0 + k
+        pair.params[INSIDE + "sigma_t.data"] = mi.TensorXf(grid)
+        pair.params.update()
+        mi.render(pair.scene, integrator=pair.recorded, seed=1, spp=1)
+        survey = pair.recorded.session._surveyed.survey
+        (_, found), *_ = survey.distances.values()
+        assert np.array_equal(found, find_empty_distances(mi.TensorXf(grid)))
+        if k == 0:
+            first = len(traced), survey.recorded.count
+    assert (len(traced), survey.recorded.count) == first and first[0] > 0
 
 
 # -- What is traced ---------------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ cell.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import drjit as dr
@@ -61,8 +62,9 @@ class Lattice:
             raise MivolError(f"a grid of shape {shape} was given; (Z, Y, X, channels) is expected: reshape it.")
         if np.prod([n + 1 for n in shape[:3]]) * self.channels >= 2**31:
             raise MivolError(f"a grid of shape {shape} was given; at most 2^31 cells and channels are expected: split it.")
-        self.to_world = check_affine(self.to_world)
-        self.from_world = opaque_rows(lattice_from_world(self.to_world, self.res))
+        given = np.asarray(self.to_world, np.float64)
+        self.to_world, from_world = _check_place(given.tobytes(), given.shape, self.res)
+        self.from_world = opaque_rows(from_world)
 
     @property
     def res(self) -> tuple[int, int, int]:
@@ -82,6 +84,13 @@ class Lattice:
         """Map points of the unit cube to the world, in float32."""
         rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in self.to_world[:3]]
         return mi.Point3f(*(dr.fma(r[0], u.x, dr.fma(r[1], u.y, dr.fma(r[2], u.z, r[3]))) for r in rows))
+
+
+@lru_cache(maxsize=256)
+def _check_place(to_world: bytes, shape: tuple[int, ...], res: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """The (4, 4) place of a grid and the (3, 4) map to its lattice, checked once: each step of a fit views the grid anew."""
+    place = check_affine(np.frombuffer(to_world).reshape(shape))
+    return place, lattice_from_world(place, res)
 
 
 @dataclass
