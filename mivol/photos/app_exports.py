@@ -1,7 +1,7 @@
 """Poses that apps export: Polycam, Record3D, 3D Scanner App (ARKit) and RealityCapture.
 
 Conventions. The phones write ARKit's poses: camera to world with the axes of :mod:`mivol.photos.camera`, y up in the world, in
-metres, of the pixels as they are stored. RealityCapture has z up. NeRFCapture and KIRI Engine write ``transforms.json``.
+metres, of the pixels as they are stored. RealityCapture has z up. NeRFCapture writes ``transforms.json``.
 
 Sources, looked up in programs that read them (nerfstudio, polyform, usa, brush):
 
