@@ -63,11 +63,13 @@ class OctreeFit(FieldFit):
     Attributes:
         stage_rows: name, PSNR, time and size of each finished stage.
         network: the fitted hash grid or NeRF, if ``field.start`` asks for one.
+        fitted: time of the fit of this network [s].
     """
 
     settings: OctreeExperiment
     problem: OctreeProblem
     network: SampledField | None = None
+    fitted: float = 0.0
     steps = "of the grid recorded in the first step, then replayed; of the leaves traced in each step"
 
     def make_plan(self, settings: OctreeExperiment) -> OctreePlan:
@@ -108,7 +110,7 @@ class OctreeFit(FieldFit):
     def render_data(self, run: RunFolder) -> None:
         """Fit the hash grid or the NeRF at which the octree begins; a run that is continued reads it."""
         self.stage_rows: list[tuple[str, ...]] = []
-        self.clock, self.fitted = 0.0, 0.0
+        self.clock = 0.0
         if self.settings.field.start not in NETWORKS:
             return
         run.make("stages")

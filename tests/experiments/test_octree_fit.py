@@ -107,6 +107,11 @@ def test_stages_stand_on_the_page(photographs: Path, field: str, names: list[str
         assert "hash grid" in json.loads((run / "run.json").read_text())["timings"]
 
 
+def test_explain_begins_an_octree_at_a_file(photographs: Path, capsys: pytest.CaptureFixture) -> None:
+    assert main(["explain", str(toml(photographs, 'start = "grid.npz"\nsteps = 1'))]) == 0
+    assert "begins at grid.npz" in capsys.readouterr().out
+
+
 def test_an_octree_needs_one_box_and_a_known_background(photographs: Path) -> None:
     for field, photos in (('preset = "capture"', ""), ("", 'background = "sky"')):
         with pytest.raises(MivolError, match="one box and a known background"):
