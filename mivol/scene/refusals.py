@@ -136,12 +136,12 @@ def check_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> No
     if medium is None:
         return
     moved = _emitter_placements(needs)
-    rgb = [m.name for m in needs.media if m.extinction == "rgb"] if is_scattering_visible(needs, settings) else []
+    collides = is_scattering_visible(needs, settings) or any(m.emits for m in needs.media)
+    rgb = [m.name for m in needs.media if m.extinction == "rgb"] if collides else []
     reasons = [
         (bool(aovs), f"aovs asks for {', '.join(aovs)}", "leave aovs out"),
         (settings.deterministic, "deterministic is set", "leave it out, for transmittance is estimated"),
-        (any(m.emits for m in needs.media), "a medium of its scene emits", "take the emission out"),
-        (bool(rgb), f"light scatters where the extinction of {', '.join(rgb)} is rgb", "make it grey, or set max_depth to 1"),
+        (bool(rgb), f"a medium scatters or emits, and the extinction of {', '.join(rgb)} is rgb", "make it grey"),
         (any(v.microflakes is not None for v in needs.views), "a medium of its scene has sggx microflakes", "take them out"),
         (bool(moved), f"the derivative of {', '.join(moved)} was requested", "use finite differences"),
     ]

@@ -184,7 +184,7 @@ REFUSED = {
     "aovs": ({"max_depth": 1, "aovs": "tau,depth"}, {}, "aovs asks for tau, depth: leave aovs out"),
     "deterministic": ({"max_depth": 1, "deterministic": True}, {}, "deterministic is set: leave it out"),
     "rgb": ({"max_depth": 3}, {**fog([1.0, 0.5, 2.0]), "albedo": 0.5}, "the extinction of fog is rgb: make it grey"),
-    "emission": ({"max_depth": 1}, {"emission": 0.5}, "a medium of its scene emits: take the emission out"),
+    "emission": ({"max_depth": 1}, {**fog([1.0, 0.5, 2.0]), "emission": 0.5}, "the extinction of fog is rgb: make it grey"),
 }
 
 

@@ -126,6 +126,11 @@ class SegmentNeeds:
         """Whether straight shadow rays from one scattering event on a segment find all light."""
         return self.scatterings <= 1 and not (self.emits or self.is_bounded or self.refracts or self.has_own_walk)
 
+    @property
+    def has_flights(self) -> bool:
+        """Whether collisions find the light: of several scatterings, or of an emission that no sum over cells holds."""
+        return (self.scatters and not self.is_single) or (self.emits and self.is_bounded)
+
 
 @dataclass(frozen=True)
 class SegmentEntry:
@@ -191,9 +196,9 @@ SEGMENT_ESTIMATORS = {
     ),
     "free_flight": SegmentEntry(
         lambda inputs: FreeFlight(inputs.direct.media),
-        lambda needs: needs.scatters and not needs.is_single and not needs.deterministic,
+        lambda needs: needs.has_flights and not needs.deterministic,
         math.inf,
-        "media scatter any number of times, or scatter and emit, are bounded, hold Gaussians or have refracting boundaries",
+        "media scatter any number of times, scatter and emit, are bounded, hold Gaussians or have refracting boundaries",
         "no bias; variance of one flight a segment",
         (
             *("woodcock_1965", "hofmann_2021", "amanatides_1987", "veach_1995", "wilkie_2014", "miller_2019"),

@@ -164,7 +164,9 @@ class FlightSegment:
 
     @property
     def _to_emission(self) -> RaySegment:
-        return RaySegment.upto(self.segment.ray, self.segment.medium, self.emission.point.t)
+        front = RaySegment.upto(self.segment.ray, self.segment.medium, self.emission.point.t)
+        front.u = self.passed.u
+        return front
 
     # -- Throughput ------------------------------------------------------------------------------------------------------
 
