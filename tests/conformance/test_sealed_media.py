@@ -161,6 +161,34 @@ def test_glass_in_view_reflects_more_samples_than_light(bsdf: dict, depth: int) 
     assert abs((light > 0).mean() - share) < 5 * (share * (1 - share) / light.size) ** 0.5
 
 
+@pytest.mark.parametrize("bsdf", [GLASS, THIN], ids=["dielectric", "thin"])
+def test_a_reflected_path_meets_glass_as_light_does(bsdf: dict) -> None:
+    """A second pane turns the view back to a lamp above the camera: it reflects the share R of what the first one reflects."""
+    R = reflectance(bsdf)
+    share = R**1.5 / (R**0.5 + (1 - R) ** 0.5)
+    place = mi.ScalarTransform4f().translate([0, 3, 0]).rotate([1, 0, 0], 45)
+    second = {"type": "rectangle", "to_world": place, "bsdf": bsdf}
+    behind = mi.ScalarTransform4f().translate([0, 3, 5]).rotate([1, 0, 0], 180)
+    lamp = {"type": "rectangle", "to_world": behind, "emitter": {"type": "area", "radiance": RADIANCE}}
+    scene = pane(bsdf, second=second, lamp=lamp)
+    light = scenes.render(scene, {"type": "mivol", "max_depth": 3}, 1, seed=3)[..., 0].ravel()
+    # R varies by 2e-3 of itself over the picture.
+    np.testing.assert_allclose(light[light > 0], RADIANCE * R**2 / share, rtol=5e-3)
+    assert abs((light > 0).mean() - share) < 5 * (share * (1 - share) / light.size) ** 0.5
+
+
+@pytest.mark.parametrize(("depth", "reflects"), [(1, False), (2, True), (-1, True)])
+def test_only_images_that_show_reflections_favour_them(depth: int, reflects: bool) -> None:
+    """At depth 1 no light is reflected. Derivatives keep Mitsuba's samples."""
+    scene, settings = pane(GLASS, lamp=lamp(5.0)), Settings(max_depth=depth)
+    survey = survey_scene(scene)
+    needs = find_needs(scene, scene.sensors()[0], survey)
+    plan = make_plan(needs, settings)
+    for for_images in (True, False):
+        estimators = build_estimators(scene, needs, plan, settings, survey, for_images)
+        assert estimators.favours_reflection == (reflects and for_images)
+
+
 def test_glass_in_even_light_adds_no_noise() -> None:
     """Both directions see 1, and R + (1 - R) = 1 needs no weights."""
     light = scenes.render(pane(THIN, sky=scenes.sky()), {"type": "mivol", "max_depth": 4}, 1, seed=3)[..., :3]
@@ -174,6 +202,27 @@ def test_glass_is_what_has_two_directions(bsdf: dict, found: bool) -> None:
     """What may also let a ray pass has three; where it stands beside glass, a lane could not tell one from the other."""
     assert survey_scene(pane(bsdf)).facts.has_glass == found
     assert survey_scene(pane(GLASS, more=ball(3.0, bsdf=bsdf))).facts.has_glass == (found or bsdf is ROUGH)
+
+
+METAL = {"type": "conductor"}
+
+
+@pytest.mark.parametrize("other", [ROUGH, METAL | {"specular_reflectance": 0.2}], ids=["blurs", "mirrors"])
+def test_blends_with_metal_are_not_taken_for_glass(other: dict) -> None:
+    """They look the same whether a ball out of view is glass or metal."""
+    blend, seen = {"type": "blendbsdf", "weight": 0.25, "metal": METAL, "other": other}, []
+    for bsdf in (GLASS, METAL):
+        scene = pane(blend, beside=ball(3.0, bsdf=bsdf), lamp=ball(0.0, center=[0.0, 5.0, 0.0], emitter={"type": "area"}))
+        assert survey_scene(scene).facts.has_glass == (bsdf is GLASS)
+        seen.append(scenes.render(scene, {"type": "mivol", "max_depth": 2}, 1, seed=3))
+    assert seen[0].max() > 0
+    np.testing.assert_array_equal(*seen)
+
+
+def test_glass_beside_instances_is_left_alone() -> None:
+    """The shapes that an instance shows have BSDFs that it does not name."""
+    kind, show = {"type": "shapegroup", "ball": ball(0.0)}, {"type": "instance", "of": {"type": "ref", "id": "kind"}}
+    assert not survey_scene(pane(GLASS, kind=kind, show=show)).facts.has_glass
 
 
 # -- Roulette of long paths ------------------------------------------------------------------------------------------------

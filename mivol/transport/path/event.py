@@ -201,8 +201,7 @@ def _favour_reflection(
     chance alone, and the few that are reflected may see a bright lamp.
     """
     bsdf, reflection = si.bsdf(), mi.BSDFFlags.DeltaReflection
-    active &= mi.has_flag(bsdf.flags(), reflection) & ((bsdf.flags() & TRANSMISSION) != 0)
-    active &= ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    active &= ((bsdf.flags() & TRANSMISSION) != 0) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     R = dr.select(mi.has_flag(sample.sampled_type, reflection), sample.pdf, 1 - sample.pdf)
     through, back = dr.safe_sqrt(1 - R), dr.safe_sqrt(R)
     chance = back / (back + through)
