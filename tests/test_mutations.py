@@ -248,20 +248,20 @@ def test_rounds_have_a_time(index, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guards, "SECOND", 25.0)
     assert index.rounds(fault_at(13), SMALL) == [
         ["tests/test_c.py::t", "tests/test_a.py::t", "tests/test_b.py::p[2]"],
-        [],
         ["tests/test_b.py::u"],
+        [],
         [],
     ]
     assert index.rounds(fault_at(13, "mivol/unknown.py"), SMALL) == [[], [], [], []]
 
 
-def test_recorded_results_judge_the_lines_that_they_run(index) -> None:
-    """In a round of their own, after the tests of the line."""
-    assert all((ROOT / file).is_file() for file in guards.OF_RESULTS)
-    name = f"{guards.OF_RESULTS[0]}::t[fog]"
-    index.tests.append(guards.RunTest(name, 5.0, 4))
-    index.runners["mivol/b.py", 13] = [0, 5]
-    assert index.rounds(fault_at(13, "mivol/b.py"), SMALL) == [["tests/test_b.py::t"], [name], [], []]
+def test_samples_judge_code_of_renders_that_tests_run(index) -> None:
+    file = "mivol/transport/a.py"
+    index.runners[file, 13] = [1]
+    assert index.rounds(fault_at(13, file), SMALL)[3] == ["-m", "slow", guards.OF_SAMPLES]
+    assert index.rounds(fault_at(13, "mivol/scene/unknown.py"), SMALL)[3] == []
+    assert (ROOT / guards.OF_SAMPLES).is_file()
+    assert all((ROOT / room).is_dir() for room in guards.SAMPLING)
 
 
 @pytest.mark.parametrize(("line", "expected"), [(3, True), (6, True), (17, True), (13, False)])
@@ -289,7 +289,7 @@ def test_slow_tests_of_a_module_come_last(index, file: str, line: int, expected:
         which, expected = "slow", expected if slow else []
     else:  # a process that is not recorded may run the line
         which = "slow or not slow" if slow else "not slow"
-    assert index.rounds(fault_at(line, file), SMALL)[3] == (["-m", which, *expected] if expected else [])
+    assert index.rounds(fault_at(line, file), SMALL)[2] == (["-m", which, *expected] if expected else [])
 
 
 def test_statements_that_no_test_runs() -> None:

@@ -30,13 +30,11 @@ OF_IMPORTS = ("tests/test_docs.py::test_reference_is_what_the_code_says",)
 """Tests of what imports compute: default arguments, settings and tables stand on the pages of the reference."""
 
 
-OF_RESULTS = (
-    "tests/conformance/test_drawn_pictures.py",
-    "tests/experiments/test_recorded_runs.py",
-    "tests/bench/test_recorded_answers.py",
-)
-"""Slow tests that compare results with recorded results: samples of renders, files of commands, answers of studies. Their lines
-are recorded with the lines of the default suite. No other test sees a fault that changes noise but no mean."""
+OF_SAMPLES = "tests/conformance/test_drawn_pictures.py"
+"""Slow tests that compare single samples of renders. A fault that changes noise but no mean is seen by no other test."""
+
+SAMPLING = ("mivol/transport/", "mivol/scene/", "mivol/phase/", "mivol/plugins/")
+"""Where code of renders stands."""
 
 
 @dataclass(frozen=True)
@@ -101,20 +99,20 @@ class Guards:
 
         1. the tests of the entries of its file, and tests that run its line, ``FIRST`` seconds of them; ``OF_IMPORTS`` for a
            line that an import runs;
-        2. tests of ``OF_RESULTS`` that run its line;
-        3. more tests that run its line, ``SECOND`` seconds of them;
-        4. if slow tests count, those in files called like the module. If no recorded test runs the line, all tests of these
-           files, because the recording sees no other processes.
+        2. more tests that run its line, ``SECOND`` seconds of them;
+        3. if slow tests count, those in files called like the module. If no recorded test runs the line, all tests of these
+           files, because the recording sees no other processes;
+        4. ``OF_SAMPLES`` for code of renders that a recorded test runs.
         """
         runners = self.find_runners(fault, source)
-        results = [test.name for test in runners if test.name.startswith(OF_RESULTS)]
-        first, rest = split_by_time([test for test in runners if test.name not in results], FIRST)
+        first, rest = split_by_time(runners, FIRST)
         of_import = OF_IMPORTS if is_of_import(source, fault.line) else ()
         one = list(dict.fromkeys([*self.listed.get(fault.file, []), *of_import, *(test.name for test in first)]))
-        more = [test.name for test in split_by_time(rest, SECOND)[0] if test.name not in one]
+        two = [test.name for test in split_by_time(rest, SECOND)[0] if test.name not in one]
         files = self.find_test_files(fault.file, is_unrun=not runners) if self.slow or not runners else []
         which = "not slow" if not self.slow else "slow" if runners else "slow or not slow"
-        return [one, results, more, ["-m", which, *files] if files else []]
+        samples = ["-m", "slow", OF_SAMPLES] if runners and fault.file.startswith(SAMPLING) else []
+        return [one, two, ["-m", which, *files] if files else [], samples]
 
     def find_test_files(self, file: str, is_unrun: bool) -> list[str]:
         """Files with slow tests that are called like a module; for an unrun line any such file, or those that import it."""
@@ -203,7 +201,7 @@ def _first_line(node: ast.stmt | ast.match_case) -> int:
 
 
 def record_suite(copy: Path, jobs: int, target: Path, slow: bool = False) -> None:
-    """Run the default suite of a checkout and ``OF_RESULTS``, or all tests, under the recorder, into a folder of parts.
+    """Run the default suite of a checkout under the recorder, or the slow tests as well; the recording is a folder of parts.
 
     Raises:
         RuntimeError: pytest wrote no recording.
@@ -214,10 +212,8 @@ def record_suite(copy: Path, jobs: int, target: Path, slow: bool = False) -> Non
     env.pop("PYTEST_XDIST_WORKER_COUNT", None)
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "mutation.recorder"]
     command += ["-n", str(jobs), "--dist", "worksteal"] if jobs > 1 else ["-p", "no:xdist"]
-    for chosen in [["-m", "slow or not slow"]] if slow else [[], ["-m", "slow", *OF_RESULTS]]:
-        done = subprocess.run(
-            [*command, *chosen], cwd=copy, env=env, capture_output=True, text=True, errors="replace", check=False
-        )
+    command += ["-m", "slow or not slow"] if slow else []
+    done = subprocess.run(command, cwd=copy, env=env, capture_output=True, text=True, errors="replace", check=False)
     if not any(target.iterdir()):
         raise RuntimeError(f"pytest ends with {done.returncode} and wrote no recording:\n{(done.stdout + done.stderr)[-2000:]}")
 

@@ -83,11 +83,12 @@ class Recorder:
         self._passed &= not report.failed
 
     def pytest_sessionfinish(self) -> None:
-        """Write the recording, each process a part of it."""
+        """Write the recording, each worker of pytest-xdist a part of it."""
+        worker = os.environ.get("PYTEST_XDIST_WORKER", "")
         if self.tests:
             folder = Path(os.environ["MIVOL_LINES"])
             folder.mkdir(parents=True, exist_ok=True)
-            (folder / f"part{os.getpid()}").write_bytes(pickle.dumps((self.tests, self.runners)))
+            (folder / f"part{worker}").write_bytes(pickle.dumps((self.tests, self.runners)))
 
 
 def pytest_configure(config: pytest.Config) -> None:
