@@ -526,6 +526,8 @@ def _explain_missing_light(needs: Needs) -> str:
     """The reason why the light of media cannot be sampled."""
     if any(m.unread for m in needs.media):
         return "the emission cannot be read while dr.freeze records"
+    if any(m.bounded for m in needs.media):
+        return "only a majorant of a medium is known"
     if any(m.has_own_walk for m in needs.media):
         return "a medium consists of Gaussians or is an octree, which the table of light does not hold"
     return "an emitting medium fills no shape of its own, or shapes are instances"

@@ -14,6 +14,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.fields.gaussian_field import GaussianField
+from mivol.fields.protocol import BOUNDED, Field
 from mivol.scene_graph import traverse
 from mivol.transport.media.medium_view import ASYMMETRY
 from mivol.transport.media.octree_extinction import LeafField
@@ -46,24 +47,27 @@ class Coefficients:
         if "velocity" in props:
             raise MivolError("mivol_medium was given a velocity; motion blur is not there yet: leave it out for a still frame.")
         given = [n for pair in COEFFICIENT_PAIRS for n in pair if n in props]
-        if is_radiance_field(props.get("emission", 0.0)) or _is_made_of_gaussians(props, "emission"):
+        if is_radiance_field(props.get("emission", 0.0)) or isinstance(_find_field(props, "emission"), GaussianField):
             return cls._of_field(props, given)
         fields = [n for n in (*given, "emission_density") if is_radiance_field(props.get(n, 0.0))]
         if fields:
             raise MivolError(f"mivol_medium was given a mivol_sh as {fields[0]}; give it as the emission, and nothing else.")
-        elsewhere = [n for n in (*given, "emission_density") if n != "sigma_t" and _is_made_of_gaussians(props, n)]
+        elsewhere = [
+            n for n in (*given, "emission_density") if n != "sigma_t" and isinstance(_find_field(props, n), GaussianField)
+        ]
         if elsewhere:
             raise MivolError(
                 f"mivol_medium was given a mivol_gaussians as {elsewhere[0]}; give it as sigma_t, with an albedo, to be lit, "
                 "or as the emission, and nothing else, to show its colours."
             )
         lights = [n for n in ("emission", "emission_density") if n in props]
-        if lights and _is_made_of_gaussians(props, "sigma_t"):
+        _refuse_points(props, ["albedo", *lights])
+        if lights and isinstance(_find_field(props, "sigma_t"), GaussianField):
             raise MivolError(
                 f"mivol_medium was given {' and '.join(lights)} beside a sigma_t of mivol_gaussians; give the Gaussians as the "
                 "emission, and nothing else, to show their own colours."
             )
-        octrees = [n for n in (*given, *lights) if _is_octree(props, n)]
+        octrees = [n for n in (*given, *lights) if isinstance(_find_field(props, n), LeafField)]
         if lights and octrees:
             raise MivolError(
                 f"mivol_medium was given {' and '.join(lights)} and a mivol_octree as {octrees[0]}; a medium that emits needs "
@@ -192,12 +196,24 @@ def is_radiance_field(value: object) -> bool:
     return hasattr(value, "mivol_field")
 
 
-def _is_made_of_gaussians(props: mi.Properties, name: str) -> bool:
-    return isinstance(getattr(props.get(name, 0.0), "mivol_extinction", None), GaussianField)
+def _refuse_points(props: mi.Properties, names: list[str]) -> None:
+    """Refuse a field without cells under one of the names.
+
+    Raises:
+        MivolError: a bounded field.
+    """
+    for name in names:
+        field = _find_field(props, name)
+        if getattr(field, "line", None) == BOUNDED:
+            raise MivolError(
+                f"mivol_medium was given a {type(field).__name__}, whose values are known at points only, as {name}; a number, "
+                "an rgb triple or a grid is expected: make the field a grid (nodes of a mivol_hash)."
+            )
 
 
-def _is_octree(props: mi.Properties, name: str) -> bool:
-    return isinstance(getattr(props.get(name, 0.0), "mivol_extinction", None), LeafField)
+def _find_field(props: mi.Properties, name: str) -> Field | GaussianField | LeafField | None:
+    """The field behind a volume of mivol; None for another volume, a number, or nothing."""
+    return getattr(props.get(name, 0.0), "mivol_extinction", None)
 
 
 def _is_shaded(props: mi.Properties, name: str) -> bool:

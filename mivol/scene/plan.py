@@ -185,11 +185,11 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         MivolError: a request that mivol does not answer (quadrature of several scatterings, derivatives of shapes), or a
             gradient step larger than the memory.
     """
+    check_bounded(needs, settings, aovs)  # first: a medium without optical depths has no other way out
     check_scattering(needs, settings)
     check_emission_cells(needs, settings)
     check_quadrature(needs, settings)
     check_placements(needs)
-    check_bounded(needs, settings, aovs)
     check_gaussians(needs, aovs)
     check_nested(needs)
     check_media_light(needs, settings)

@@ -97,10 +97,12 @@ def check_quadrature(needs: Needs, settings: Settings) -> None:
             "(point, spot, directional): leave deterministic out."
         )
     if len(needs.media) > 1 or not shares_cells(needs.views[0]):
-        grids = sum(len(m.resolutions) for m in needs.media)
+        first, grids = needs.media[0], len(needs.media[0].resolutions)
+        found = f"the medium in {first.name} has {f'{grids} grids of unlike cells' if grids else 'no grid'} in its extinction"
+        found = f"the scene has {len(needs.media)} media" if len(needs.media) > 1 else found
         raise MivolError(
-            f"deterministic is set and the scene has {len(needs.media)} media with {grids} grids of extinction; quadrature is "
-            "for one medium whose grids share their cells: leave deterministic out."
+            f"deterministic is set and {found}; quadrature is for one medium whose grids share their cells: leave "
+            "deterministic out."
         )
     constant = next((part.name for part in needs.views[0].parts if part.is_constant), None)
     if settings.shadows == "grid" and constant is not None:

@@ -105,6 +105,17 @@ def test_beer_lambert_through_a_ball(boundary: str, slack: float) -> None:
 
 
 @pytest.mark.statistical
+def test_a_ball_that_glows() -> None:
+    """With tau the optical depth of a chord, the light is SKY exp(-tau) + 3 (1 - exp(-tau)); means and derivatives agree."""
+    chord = 2 * np.sqrt(0.8**2 - 0.5**2)
+    found = scene([0, -4, 0.5], [0, 0, 0.5], fog=shape("cube", {**fog(radius=0.8), "emission": 3.0}))
+    image, tangent, _ = follow(found, ("sigma_t.sigma",), spp=4 * SPP)
+    passed = np.exp(-1.5 * SCALE * chord)
+    check(image[..., 0], SKY * passed + 3 * (1 - passed), "the radiance")
+    check(tangent[..., 0], SCALE * chord * (3 - SKY) * passed, "the derivative by sigma")
+
+
+@pytest.mark.statistical
 def test_colours_and_the_scale_of_the_medium() -> None:
     """Each channel by itself, under a common majorant; the scale has a derivative like the field's own parameters."""
     sigma, chord = [0.3, 1.0, 2.0], 1.6
@@ -183,6 +194,7 @@ def test_several_passes_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
 REFUSED = {
     "aovs": ({"max_depth": 1, "aovs": "tau,depth"}, {}, "aovs asks for tau, depth: leave aovs out"),
     "deterministic": ({"max_depth": 1, "deterministic": True}, {}, "deterministic is set: leave it out"),
+    "scattering": ({"max_depth": 3, "deterministic": True}, {"albedo": 0.5}, "deterministic is set: leave it out"),
     "rgb": ({"max_depth": 3}, {**fog([1.0, 0.5, 2.0]), "albedo": 0.5}, "the extinction of fog is rgb: make it grey"),
     "emission": ({"max_depth": 1}, {**fog([1.0, 0.5, 2.0]), "emission": 0.5}, "the extinction of fog is rgb: make it grey"),
 }
@@ -194,6 +206,12 @@ def test_what_needs_an_exact_line_is_refused_by_name(asked: str) -> None:
     found = scene([0, -4, 0], [0, 0, 0], fog=shape("cube", {**fog(), **medium}))
     with pytest.raises(MivolError, match=f"the medium in fog is a Ball, which is bounded .*{sentence}"):
         mi.render(found, integrator=mi.load_dict({"type": "mivol", **settings}), spp=1)
+
+
+def test_light_that_cannot_be_drawn_is_refused() -> None:
+    found = scene([0, -4, 0], [0, 0, 0], fog=shape("cube", {**fog(), "albedo": 0.5, "emission": 1.0}))
+    with pytest.raises(MivolError, match="media_light is 'drawn', and only a majorant of a medium is known"):
+        mi.render(found, integrator=mi.load_dict({"type": "mivol", "max_depth": 3, "media_light": "drawn"}), spp=1)
 
 
 def test_a_majorant_that_is_none_is_refused() -> None:

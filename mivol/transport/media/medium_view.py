@@ -146,8 +146,9 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
         for name in names
     ]
     of_albedo = "sigma_s." if "sigma_s" in names else "albedo."
-    # The numbers of the bricks of a sparse grid are no values.
-    albedo_arrays = [v for k, v in values if k.startswith(of_albedo) and not k.endswith(".bricks")]
+    own = {k: v for k, v in values if k.startswith(of_albedo)}
+    # Of a grid, its values alone: not what they are made of (weights, a table), nor the numbers of bricks.
+    albedo_arrays = [own[of_albedo + "data"]] if of_albedo + "data" in own else list(own.values())
     albedo = _field(params, "albedo") if "sigma_s" not in names else None
     emission, emission_density = _field(params, "emission"), _field(params, "emission_density")
     emission_arrays = [v for k, v in values if k.startswith("emission") and k.endswith((".data", ".value.value"))]
