@@ -22,7 +22,7 @@ from mivol.experiments.fit_kind import Distribution, FitKind, RunContext
 from mivol.experiments.gaussian_fit import GaussianFit
 from mivol.experiments.octree_fit import OctreeFit
 from mivol.experiments.photo_fit import PhotoFit
-from mivol.experiments.run_folder import CHECKPOINT, SECONDS_BETWEEN_PAGES, BestIterate, RunFolder
+from mivol.experiments.run_folder import SECONDS_BETWEEN_PAGES, BestIterate, RunFolder, find_checkpoint
 from mivol.experiments.sampled_fit import SampledFit
 from mivol.experiments.scan_fit import ScanFit
 from mivol.experiments.scene_fit import SceneFit
@@ -63,7 +63,7 @@ def run_experiment(context: RunContext) -> Path:
     if getattr(settings, "slabs", None) is not None:
         return run_slabs(context)
     if context.resume:
-        checkpoint.check_settings(context.folder / CHECKPOINT, config.flatten_settings(config.resolved(settings)))
+        checkpoint.check_settings(find_checkpoint(context.folder), config.flatten_settings(config.resolved(settings)))
     choose_back_end(settings.variant, settings.threads)
     kind = KINDS[type(settings)](context)
     kind.record.notes += context.notes
@@ -145,7 +145,8 @@ def complete_fit(
         KeyboardInterrupt: Ctrl-C; the checkpoint has been written.
     """
     course, context = kind.course(), kind.context
-    store = CheckpointFile(run.checkpoint, kind.digests() | config.flatten_settings(run.record.config), context.resume)
+    goes_on = context.resume and run.checkpoint == find_checkpoint(run.path)
+    store = CheckpointFile(run.checkpoint, kind.digests() | config.flatten_settings(run.record.config), goes_on)
 
     def measure(problem: Problem) -> dict[str, float]:
         errors = kind.measure(problem)

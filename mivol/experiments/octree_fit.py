@@ -15,18 +15,20 @@ from typing import Any
 
 import numpy as np
 
-from mivol.config import OctreeExperiment, OctreeSettings
+from mivol.config import OctreeExperiment, OctreeSettings, flatten_settings
 from mivol.errors import MivolError
 from mivol.experiments.field_conversion import describe_leaves, describe_speed
 from mivol.experiments.field_fit import FieldFit, adapt_plan, explain_plan, make_batches, set_background, write_result
 from mivol.experiments.fit_kind import Say
-from mivol.experiments.run_folder import RunFolder
+from mivol.experiments.run_folder import FIRST_CHECKPOINT, RunFolder
 from mivol.experiments.sampled_fit import SampledFit, explain_sampled_plan, make_sampled_problem
 from mivol.fields.field_files import read_field, write_field
 from mivol.fields.octree import Octree
 from mivol.fields.sampled_field import SampledField
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import write_whole
+from mivol.optim.checkpoint import CheckpointFile
+from mivol.optim.events import Checkpoint
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.octree_building import OctreeRecipe, build_octree, build_octree_of_points
@@ -108,7 +110,7 @@ class OctreeFit(FieldFit):
         return [*explain_plan(grid, self.photos, self.batches), built, steps]
 
     def render_data(self, run: RunFolder) -> None:
-        """Fit the hash grid or the NeRF at which the octree begins; a run that is continued reads it."""
+        """Fit the hash grid or the NeRF at which the octree begins; a resumed run reads it, or goes on with its fit."""
         self.stage_rows: list[tuple[str, ...]] = []
         self.clock = 0.0
         if self.settings.field.start not in NETWORKS:
@@ -127,7 +129,11 @@ class OctreeFit(FieldFit):
     def fit_network(self, run: RunFolder, plan: SampledPlan, path: Path) -> None:
         """Fit the hash grid or the NeRF, and write it to ``path``."""
         problem = make_sampled_problem(plan, self.photos, self.settings.seed)
-        fit = begin_fit(problem, plan.optimizer, plan.course())
+        first, fingerprint = run.path / FIRST_CHECKPOINT, flatten_settings(run.record.config)
+        fingerprint["photos"] = problem.batches.digest()
+        store = CheckpointFile(first, fingerprint, run.is_resumed and first.is_file())
+        course = plan.course(Checkpoint(every=self.settings.checkpoint_every))
+        fit = begin_fit(problem, plan.optimizer, course, checkpoint=store)
         with self.context.progress.watch(plan.steps) as show:
             fit.complete(show)
         self.clock = self.fitted = fit.seconds
@@ -179,6 +185,10 @@ class OctreeFit(FieldFit):
                 self.add_stage(run, self.start.noun, self.start)
             self.clock = self.built
             self.add_stage(run, STAGES[1], self.problem.tree)
+
+    def finish(self, fit: Fit, run: RunFolder) -> None:
+        super().finish(fit, run)
+        (run.path / FIRST_CHECKPOINT).unlink(missing_ok=True)
 
     def add_stage(self, run: RunFolder, name: str, field: AnyField, path: Any = None) -> str:
         """Write the field of a stage, and note its quality, time and size; returns a clause for the log."""

@@ -38,6 +38,8 @@ from mivol.report.record import (
 )
 
 CHECKPOINT = "checkpoint.npz"
+FIRST_CHECKPOINT = "stages/checkpoint.npz"
+"""The checkpoint of a fit before the run's own: that of the network at which an octree begins."""
 BEST = "best.npz"
 EARLIER = "earlier"
 KEPT = (RECORD, METRICS, CHECKPOINT, BEST, "report.html")
@@ -45,6 +47,12 @@ KEPT = (RECORD, METRICS, CHECKPOINT, BEST, "report.html")
 
 SECONDS_BETWEEN_PAGES = 5.0
 """Interval between two pages of a run under way on a cluster."""
+
+
+def find_checkpoint(folder: Path) -> Path:
+    """The newest checkpoint of a run: its own, or ``FIRST_CHECKPOINT`` if only that exists."""
+    own, first = folder / CHECKPOINT, folder / FIRST_CHECKPOINT
+    return first if first.is_file() and not own.is_file() else own
 
 
 class RunFolder:

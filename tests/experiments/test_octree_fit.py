@@ -14,9 +14,11 @@ from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.experiments.octree_fit import NETWORKS, find_preset, make_network_plan, make_octree_plan, read_start
+from mivol.experiments.run_folder import FIRST_CHECKPOINT
 from mivol.fields.field_files import read_field, write_field
 from mivol.fields.octree import Octree
 from mivol.files import decode_srgb, write_png
+from mivol.optim.loop import Fit
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import PRESETS
 from mivol.optim.photographs.sampled_problem import PRESETS as SAMPLED
@@ -105,6 +107,32 @@ def test_stages_stand_on_the_page(photographs: Path, field: str, names: list[str
         assert main(["optimize", str(photographs / "fit.toml"), "-o", str(run), "--resume"]) == 0
         assert json.loads((run / "stages" / "stages.json").read_text())[0] == network
         assert "hash grid" in json.loads((run / "run.json").read_text())["timings"]
+
+
+@pytest.mark.slow
+def test_an_interrupted_network_goes_on(photographs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Within its own fit: a resumed run has the network of a run that was not interrupted."""
+    path = toml(photographs, 'start = "hash"\npreset = "tiny"\neffort = 0.1\nsteps = 2\ndepth = 4')
+    assert make_network_plan(config.load(path)).steps > 4
+    advance, begun = Fit.advance, []
+
+    def stop(fit: Fit) -> None:
+        if fit.next_iteration == 3:
+            raise KeyboardInterrupt
+        advance(fit)
+
+    stopped, whole = photographs / "stopped", photographs / "whole"
+    monkeypatch.setattr(Fit, "advance", stop)
+    assert main(["optimize", str(path), "-o", str(stopped)]) == 130
+    assert (stopped / FIRST_CHECKPOINT).is_file()
+    monkeypatch.setattr(Fit, "advance", lambda fit: (begun.append(fit.next_iteration), advance(fit)))
+    assert main(["optimize", str(path), "-o", str(stopped), "--resume"]) == 0
+    assert begun[0] == 3 and not (stopped / FIRST_CHECKPOINT).exists()
+    assert main(["optimize", str(path), "-o", str(whole)]) == 0
+    networks = [np.load(folder / "stages" / "hash.npz") for folder in (stopped, whole)]
+    for name in (key for key in networks[1].files if networks[1][key].dtype.kind == "f"):
+        # Threads add derivatives in no fixed order, and values are written in half precision: its last place is 2^-10.
+        np.testing.assert_allclose(networks[0][name], networks[1][name], rtol=2**-10, atol=1e-6)
 
 
 def test_explain_begins_an_octree_at_a_file(photographs: Path, capsys: pytest.CaptureFixture) -> None:
