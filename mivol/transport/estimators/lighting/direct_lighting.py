@@ -28,7 +28,6 @@ from mivol.transport.estimators.lighting.emitters import (
     ChosenEmitter,
     EventSamples,
     SceneEmitters,
-    eval_direction,
     is_among,
 )
 from mivol.transport.estimators.lighting.moving_emitters import attach_position, moving_transmittance
@@ -242,10 +241,11 @@ class DirectLighting:
         with dr.resume_grad(when=attached):
             source, moved = sample.weight, direct
             if attached:
-                placed, _ = sample.emitter.sample_direction(it, sample.u, on)
+                placed, source = sample.emitter.sample_direction(it, sample.u, on)
                 if dr.grad_enabled(placed.p):
                     moved = attach_position(placed, direct)
-                source = eval_direction(sample.emitter, it, moved, on) / direct.pdf
+                if self.emitters.are_evaluated:
+                    source = sample.emitter.eval_direction(it, moved, on) / direct.pdf
                 if dr.grad_enabled(moved.p):
                     source = source * moving_transmittance(self.media, ray_segment, tau, moved.p, on)
                 if not dr.grad_enabled(source, moved):

@@ -56,6 +56,7 @@ class SceneEmitters:
         transmissive: emitters on surfaces that transmit part of the light without deviation.
         samples_phase: phase functions are sampled too, since their directions can hit an emitter.
         is_near: some emitter has a finite distance.
+        are_evaluated: ``eval_direction`` of all emitters of the scene is there.
     """
 
     def __init__(self, scene: mi.Scene, from_camera: bool = False, distance: str = "any") -> None:
@@ -71,6 +72,8 @@ class SceneEmitters:
         self.is_near = any(b is not None for b in balls)
         self._balls = [None if b is None else [dr.opaque(mi.Float, v) for v in b] for b in balls]
         self._from_camera = from_camera
+        # Dr.Jit records a call for every emitter of the scene, chosen or not.
+        self.are_evaluated = all(e.class_name() != PARALLEL_AREA for e in scene.emitters())
         if self.sampled:
             self._table = _EmitterTable.of(scene, self.sampled, self._balls)
             self._grid = tabulate_emitters(self._table.pointers, find_lit_box(scene), self.is_near)
@@ -227,18 +230,6 @@ class _EmitterTable:
         """Centre and radius of an emitter [length], and whether its distance is finite."""
         x, y, z, r, finite = (dr.gather(mi.Float, column, number) for column in self.balls)
         return x, y, z, r, finite > 0
-
-
-def eval_direction(emitter: mi.EmitterPtr, it: mi.Interaction3f, direct: mi.DirectionSample3f, active: mi.Bool) -> mi.Color3f:
-    """Radiance from the sampled place on an emitter towards a point [radiance]."""
-    return dr.dispatch(emitter, _eval_implemented_direction, it, direct, active)
-
-
-def _eval_implemented_direction(
-    emitter: mi.Emitter, it: mi.Interaction3f, direct: mi.DirectionSample3f, active: mi.Bool
-) -> mi.Color3f:
-    # Dr.Jit records the call for every emitter in memory, those of other scenes too.
-    return mi.Color3f(0) if emitter.class_name() == PARALLEL_AREA else emitter.eval_direction(it, direct, active)
 
 
 def join_arrays(values: list[mi.Float] | list[mi.UInt32], at_once: int = 16) -> mi.Float | mi.UInt32:
