@@ -21,7 +21,6 @@ __all__ = [
     "choose_emission_rays",
     "choose_scattering_points",
     "choose_flights",
-    "choose_glass",
     "choose_image_branches",
     "choose_lamp_rays",
     "choose_lighting",
@@ -242,15 +241,6 @@ def choose_tracing(needs: Needs) -> Choice:
         return Choice("acceleration structure", "traced", why)
     why = "every shape is the box or ball of a medium: rays are clipped in float64"
     return Choice("acceleration structure", "not traced", why)
-
-
-def choose_glass(needs: Needs, settings: Settings) -> tuple[bool, list[Choice]]:
-    """Choose whether smooth glass seen by the camera reflects more samples than light, in images."""
-    # Under even light both directions see the same.
-    if not needs.has_glass or settings.scatterings < 1 or all(kind == "uniform" for kind in needs.emitter_kinds):
-        return False, []
-    why = "few samples would be reflected by chance, and what they see may be bright"
-    return True, [Choice("glass in view", "reflects camera rays in proportion to the square root of its reflectance", why)]
 
 
 def choose_channels(needs: Needs) -> Choice:

@@ -24,7 +24,6 @@ from mivol.scene.choices import (
     choose_emission,
     choose_emission_rays,
     choose_flights,
-    choose_glass,
     choose_image_branches,
     choose_lamp_rays,
     choose_lighting,
@@ -120,7 +119,6 @@ class Plan:
         have_low_albedo: whether some albedo of each medium may be too low for derivatives to be found at collisions.
         shadow_nodes: nodes along an edge of the table of shadows, in images; 0 for shadow rays.
         emission_rays: own camera rays of a pixel for the light of media that does not scatter, in images; 0 for none.
-        favours_reflection: whether smooth glass seen by the camera reflects more samples than light, in images.
         lamp_rays: own camera rays a sample for the light of lamps seen directly, in images; 0 for none.
         occupied: share of occupied blocks of the first medium's grid, in steps of ``OCCUPIED_STEP`` [1]; None if unknown.
     """
@@ -147,7 +145,6 @@ class Plan:
     lamp_rays: int
     shadow_nodes: int
     emission_rays: int
-    favours_reflection: bool
 
     @property
     def decisions(self) -> tuple:
@@ -235,8 +232,6 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     choices += why
     emission_rays, why = choose_emission_rays(needs, settings, segment)
     choices += why
-    glass, why = choose_glass(needs, settings)
-    choices += why
     nodes, why = choose_shadow_table(needs, settings, segment)
     choices += why
     return Plan(
@@ -262,7 +257,6 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         lamp_rays,
         nodes,
         emission_rays,
-        glass,
     )
 
 
@@ -395,8 +389,7 @@ def build_estimators(
     if draws_near_light:
         inside = [scene.emitters()[number] for number in plan.near_emitters]
         near = NearLighting(direct, 0.0 if for_images else PROBE_DEPTH, inside)
-    estimators = Estimators(direct, segment, settings, lights_surfaces, lights_media, lobe, emission, long_paths_count, near)
-    return replace(estimators, favours_reflection=for_images and plan.favours_reflection)
+    return Estimators(direct, segment, settings, lights_surfaces, lights_media, lobe, emission, long_paths_count, near)
 
 
 def _make_emission_sampling(scene: mi.Scene, media: SceneMedia, needs: Needs) -> EmissionSampling:

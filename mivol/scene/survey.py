@@ -81,7 +81,6 @@ class ShapeFacts:
         is_sealed: whether every medium lies behind refracting boundaries without undeviated light, with all emitters outside
             and hittable by paths. Emitter sampling then finds no light from inside a medium.
         stops_rays: whether every traced boundary of a medium stops or turns all rays, so that a segment stays in one medium.
-        has_glass: whether a surface is smooth glass, and no other surface reflects and transmits without blur.
         surface_boxes: (3, 4) maps from the world to cubes [-1, 1]^3 around the ``surfaces``; None for many surfaces, or with a
             traced boundary of a medium.
     """
@@ -94,7 +93,6 @@ class ShapeFacts:
     refractive: tuple[str, ...] = ()
     is_sealed: bool = False
     stops_rays: bool = False
-    has_glass: bool = False
     surface_boxes: tuple[np.ndarray, ...] | None = None
 
 
@@ -217,24 +215,9 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
         refractive=tuple(refractive),
         is_sealed=_are_sealed(boundaries, shapes, scene.emitters()),
         stops_rays=not has_null and not any(_is_bare(edge) for edge in edges),
-        has_glass=_has_glass(surfaces),
         surface_boxes=pieces if 0 < len(pieces) <= MAX_SURFACE_BOXES else None,
     )
     return SceneSurvey(tuple(boundaries), facts, marks, scene_diagonal(scene), tracer)
-
-
-GLASS = {"SmoothDielectric", "ThinDielectric"}
-"""Mitsuba's classes of smooth glass."""
-
-
-def _has_glass(surfaces: list[mi.Shape]) -> bool:
-    """Whether some surfaces are smooth glass, and all that reflect and transmit without blur are."""
-    if any(is_instance(shape) for shape in surfaces):
-        return False
-    bsdfs = [shape.bsdf() for shape in surfaces]
-    transmission = int(mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.Null)
-    clear = [b for b in bsdfs if mi.has_flag(b.flags(), mi.BSDFFlags.DeltaReflection) and int(b.flags()) & transmission]
-    return bool(clear) and all(b.class_name() in GLASS for b in clear)
 
 
 def _read_placement(shape: mi.Shape) -> object:

@@ -243,7 +243,6 @@ class Estimators:
         near: estimator of the light of near emitters along segments of paths in media; None if vertices draw this light.
         camera_emission: weight of the light that media emit towards the camera without scattering [1]: 0 if this light has
             camera rays of its own.
-        favours_reflection: smooth glass seen by the camera reflects more samples than light.
         shows: emitters that the camera sees directly: "all", the "lamps" (emitters with a surface), or the "rest".
         media: media of the scene.
         draws_shadows: shadow rays of vertices are estimated, by tracking or by roulette, with a random number.
@@ -260,7 +259,6 @@ class Estimators:
     near: NearLighting | None = None
     shows: str = "all"
     camera_emission: mi.Float | float = 1.0
-    favours_reflection: bool = False
     media: SceneMedia = field(init=False)
     draws_shadows: bool = field(init=False)
 

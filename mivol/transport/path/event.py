@@ -126,13 +126,11 @@ class DirectionSamples:
         component: uniform random number in [0, 1) for the component of the BSDF or phase function.
         direction: two uniform random numbers in [0, 1) for the direction.
         aimed: directions around emitters, drawn for a share of the samples (lobes in media only); None for no such directions.
-        favours_reflection: lanes in which smooth glass reflects more samples than light; None for no lanes.
     """
 
     component: mi.Float
     direction: mi.Point2f
     aimed: AimedDirections | None = None
-    favours_reflection: mi.Bool | None = None
 
 
 PER_LANE = ("ray", "medium", "weight", "pdf", "delta", "eta", "origin", "on", "through")
@@ -168,8 +166,6 @@ def _sample_bsdf(
     media, si = estimators.media, event.si
     bsdf = si.bsdf()
     sample, weight = bsdf.sample(mi.BSDFContext(), si, samples.component, samples.direction, event.at_surface)
-    if samples.favours_reflection is not None:
-        sample, weight = _favour_reflection(si, sample, weight, samples, event.at_surface & samples.favours_reflection)
     if samples.aimed is not None and samples.aimed.cosine is None:
         sample, weight = _mix_bsdf(si, sample, weight, samples, event.at_surface)
     through = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
@@ -190,26 +186,6 @@ def _sample_bsdf(
         through=through,
         factors=[TrackedFactor(lambda: bsdf.eval(mi.BSDFContext(), si, sample.wo, on & ~through), on & ~through)],
     )
-
-
-def _favour_reflection(
-    si: mi.SurfaceInteraction3f, sample: mi.BSDFSample3f, weight: mi.Spectrum, samples: DirectionSamples, active: mi.Bool
-) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
-    """Sample smooth glass anew: reflection in proportion to sqrt(R), transmission in proportion to sqrt(1 - R).
-
-    R is the reflectance, with which Mitsuba's `dielectric` and `thindielectric` reflect. Nearly all samples are transmitted by
-    chance alone, and the few that are reflected may see a bright lamp.
-    """
-    bsdf, reflection = si.bsdf(), mi.BSDFFlags.DeltaReflection
-    active &= ((bsdf.flags() & TRANSMISSION) != 0) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    R = dr.select(mi.has_flag(sample.sampled_type, reflection), sample.pdf, 1 - sample.pdf)
-    through, back = dr.safe_sqrt(1 - R), dr.safe_sqrt(R)
-    chance = back / (back + through)
-    reflects = samples.component < chance
-    # Mitsuba reflects for numbers below R.
-    anew, value = bsdf.sample(mi.BSDFContext(), si, dr.select(reflects, 0.5 * R, 0.5 + 0.5 * R), samples.direction, active)
-    value *= dr.select(reflects, R / chance, (1 - R) / (1 - chance))
-    return dr.select(active, anew, sample), dr.select(active, value, weight)
 
 
 def _mix_bsdf(

@@ -476,8 +476,6 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
 
     # -- The next direction --------------------------------------------------------------------------------------------
     samples = DirectionSamples(sampler.next_1d(arrives), sampler.next_2d(arrives))
-    if estimators.favours_reflection:
-        samples.favours_reflection = path.depth == 0
     if path.emitter_sample is not None:
         samples.aimed = aimed
     elif estimators.near is not None and estimators.near.aims:
