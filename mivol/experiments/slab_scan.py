@@ -295,7 +295,7 @@ def _slab_bytes(
     """Memory of the largest of some slabs [byte]."""
     kind = "direct" if settings.solve.name in DIRECT else "iterative"
     views, _, columns = beam.shape
-    if settings.solve.name in SWEPT and isinstance(beam, ConeBeam):
+    if _is_swept(settings.solve, beam):
         views = _views_at_once(settings, beam)
     most = 0.0
     for part in layers:
@@ -387,7 +387,7 @@ def run_slabs(context: RunContext) -> Path:
             caption = _write_preview(plan, preview_rows(plan), run.path)
             record.images.append(Image(path=PREVIEW, role="picture", caption=caption))
             context.progress.say([f"{run.path / PREVIEW}: {caption}"])
-        solved = _sweep(plan, state, run, context) if _is_swept(plan) else None
+        solved = _sweep(plan, state, run, context) if _is_swept(plan.settings.solve, plan.source.beam) else None
         with run.stage("slabs"):
             writer = _open_writer(plan, run)
             for layers in context.progress.track(plan.layers, "slabs"):
@@ -422,16 +422,16 @@ def explain_slabs(settings: config.ScanExperiment, base: Path, say: Say) -> Expl
     return Explanation((f"  solver    {plan.settings.solve.name}, slab by slab",))
 
 
-def _is_swept(plan: SlabPlan) -> bool:
-    return plan.settings.solve.name in SWEPT and isinstance(plan.source.beam, ConeBeam)
+def _is_swept(solve: config.SolveSettings, beam: ParallelBeam | ConeBeam) -> bool:
+    return solve.name in SWEPT and isinstance(beam, ConeBeam)
 
 
 def make_sweeps(plan: SlabPlan, folder: Path) -> DiskSweeps:
     """Return the sweeps of a cone beam's iterative solver over the files of a folder."""
     solve, views = plan.settings.solve, plan.source.beam.shape[0]
-    options: dict[str, Any] = {"relaxation": solve.relaxation} if solve.name == "os-sart" else {}
+    options: dict[str, Any] = {}
     if solve.name == "os-sart":
-        options |= {"n_subsets": min(solve.subsets, views), "decay": solve.decay}
+        options = {"n_subsets": min(solve.subsets, views), "relaxation": solve.relaxation, "decay": solve.decay}
     return DiskSweeps(
         plan.source.beam,
         plan.grid,
@@ -469,19 +469,20 @@ def _sweep(plan: SlabPlan, state: dict[str, Any], run: RunFolder, context: RunCo
             at = SweepState(**state["sweeps"])
         else:
             at = prepare_sweeps(plan, sweeps)
-            _keep(state, at, run.path)
+            _keep(state, run.path, sweeps=asdict(at))
         total = plan.settings.solve.iterations * sweeps.n_subsets
         states = sweeps.run(at)
         for _ in context.progress.track(range(at.steps, total), "subsets"):
             at = next(states)
-            _keep(state, at, run.path)
+            _keep(state, run.path, sweeps=asdict(at))
     norms = ", ".join(f"{value:.4g}" for value in (at.residuals[0], at.residuals[-1]))
     context.progress.say([f"{len(at.residuals)} sweeps over the volume; residual of the first and the last: {norms}"])
     return sweeps.volume(at)
 
 
-def _keep(state: dict[str, Any], at: SweepState, folder: Path) -> None:
-    state["sweeps"] = asdict(at)
+def _keep(state: dict[str, Any], folder: Path, **more: Any) -> None:
+    """Add to the progress of a run, and write it."""
+    state |= more
     write_whole_text(folder / STATE, json.dumps(state))
 
 
@@ -499,8 +500,7 @@ def _complete_slab(
         return
     volume = reconstruct_slab(plan, layers) if solved is None else np.array(solved[layers])
     writer.write(layers.start, volume)
-    state["done"][key] = _compare(plan, layers, volume)
-    write_whole_text(folder / STATE, json.dumps(state))
+    _keep(state, folder, done=state["done"] | {key: _compare(plan, layers, volume)})
 
 
 def reconstruct_slab(plan: SlabPlan, layers: slice) -> np.ndarray:

@@ -158,10 +158,10 @@ def _column_names(line: str) -> list[str]:
 
 
 def _reality_capture_entry(file: Path, name: str, row: Mapping[str, str]) -> Entry:
-    image = next((found for place in ("images", "") if (found := find_image(file.parent / place / name)).is_file()), None)
-    image = image or find_image(file.parent / name)
-    pose = {key: _numbers(file, dict(row), key, 0) for key in POSE_COLUMNS}
-    more = {key: _numbers(file, dict(row), key, 0) for key in ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2") if row.get(key)}
+    beside = find_image(file.parent / name)
+    image = next((found for found in (find_image(file.parent / "images" / name), beside) if found.is_file()), beside)
+    pose = {key: _numbers(file, row, key, 0) for key in POSE_COLUMNS}
+    more = {key: _numbers(file, row, key, 0) for key in ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2") if row.get(key)}
     turn = Rotation.from_euler("ZXY", [-pose["heading"], pose["pitch"], pose["roll"]], degrees=True).as_matrix()
     to_world = _to_world(np.column_stack([turn, [pose["x"], pose["y"], pose["alt"]]]))
     terms = {"t1": "p1", "t2": "p2"}
@@ -199,7 +199,7 @@ def _read_table(file: Path) -> dict[str, Any]:
     return table
 
 
-def _numbers(file: Path, table: dict[str, Any], key: str, count: int | tuple[int, int]) -> Any:
+def _numbers(file: Path, table: Mapping[str, Any], key: str, count: int | tuple[int, int]) -> Any:
     """The finite number (``count`` 0), list of numbers or table of numbers under a key."""
     shape = () if count == 0 else (count,) if isinstance(count, int) else count
     try:

@@ -97,9 +97,10 @@ def check_quadrature(needs: Needs, settings: Settings) -> None:
             "(point, spot, directional): leave deterministic out."
         )
     if len(needs.media) > 1 or not shares_cells(needs.views[0]):
-        first, grids = needs.media[0], len(needs.media[0].resolutions)
-        found = f"the medium in {first.name} has {f'{grids} grids of unlike cells' if grids else 'no grid'} in its extinction"
-        found = f"the scene has {len(needs.media)} media" if len(needs.media) > 1 else found
+        medium, found = needs.media[0], f"the scene has {len(needs.media)} media"
+        if len(needs.media) == 1:
+            grids = f"{len(medium.resolutions)} grids of unlike cells" if medium.resolutions else "no grid"
+            found = f"the medium in {medium.name} has {grids} in its extinction"
         raise MivolError(
             f"deterministic is set and {found}; quadrature is for one medium whose grids share their cells: leave "
             "deterministic out."

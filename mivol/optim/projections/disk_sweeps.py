@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -87,9 +88,8 @@ class DiskSweeps:
             for layers in self.slabs:
                 self._open("volume_0", "r+")[layers] = start(layers)
         self._create("sums", (self.n_subsets, *self.grid.shape))
-        chords = Projector(self.beam, VoxelGrid((1, 1, 1), tuple(self.grid.extent), self.grid.centre))
         subsets = [self._views(s) for s in range(self.n_subsets)]
-        longest = [max(float(self._chords(chords, some).max()) for some in self._batches(views)) for views in subsets]
+        longest = [max(float(self._box.subset(some).row_sums.max()) for some in self._batches(views)) for views in subsets]
         largest = np.zeros(self.n_subsets)
         for layers in self.slabs:
             a, inner, rows_seen = self._slab(layers)
@@ -103,12 +103,11 @@ class DiskSweeps:
 
     def run(self, state: SweepState) -> Iterator[SweepState]:
         """The state after each further subset, without end."""
-        chords = Projector(self.beam, VoxelGrid((1, 1, 1), tuple(self.grid.extent), self.grid.centre))
         while True:
             sweep, s = divmod(state.steps, self.n_subsets)
             views = self._views(s)
             self._subtract_prediction(views, self.volume(state))
-            square = state.square + self._weigh_residual(views, chords, state.longest[s])
+            square = state.square + self._weigh_residual(views, state.longest[s])
             strength = np.float32(self.relaxation * self.decay**sweep)
             for layers in self.slabs:
                 self._update(layers, s, views, strength, state)
@@ -132,13 +131,13 @@ class DiskSweeps:
             for some in self._batches(views):
                 self._open("residual", "r+")[some, rows] -= a.subset(some) @ x
 
-    def _weigh_residual(self, views: np.ndarray, chords: Projector, longest: float) -> float:
+    def _weigh_residual(self, views: np.ndarray, longest: float) -> float:
         """Divide the residual by the length of each ray, 0 for rays that are not used; return its square before."""
         square = 0.0
         for some in self._batches(views):
             r = np.nan_to_num(self._open("residual")[some], nan=0.0)
             square += float(np.sum(r * r, dtype=np.float64))
-            self._open("residual", "r+")[some] = r * reciprocal(self._chords(chords, some), longest)
+            self._open("residual", "r+")[some] = r * reciprocal(self._box.subset(some).row_sums, longest)
         return square
 
     def _update(self, layers: slice, s: int, views: np.ndarray, strength: np.float32, state: SweepState) -> None:
@@ -164,10 +163,10 @@ class DiskSweeps:
     def _batches(self, views: np.ndarray) -> Iterator[np.ndarray]:
         return (views[first : first + self.views_at_once] for first in range(0, len(views), self.views_at_once))
 
-    @staticmethod
-    def _chords(chords: Projector, views: np.ndarray) -> np.ndarray:
-        """Lengths (views, rows, cols) of rays in the grid [length]."""
-        return chords.subset(views) @ np.ones((1, 1, 1), np.float32)
+    @cached_property
+    def _box(self) -> Projector:
+        """The grid as one voxel, in which rays are as long as in all its voxels."""
+        return Projector(self.beam, VoxelGrid((1, 1, 1), tuple(self.grid.extent), self.grid.centre))
 
     def _create(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
         return np.lib.format.open_memmap(self.folder / f"{name}.npy", "w+", np.float32, shape)
