@@ -24,8 +24,7 @@ import pytest
 from scipy import stats
 
 from mivol.validate import statistics
-from mivol.validate.moments import Moments
-from mivol.validate.statistics import Estimate, Significance, effective_dof
+from mivol.validate.statistics import Estimate, Moments, Significance, effective_dof
 
 ALPHA = 4e-9
 """Chance of a false alarm of one comparison, of all its pixels together. Some 1200 of them, slow ones included, add up to half

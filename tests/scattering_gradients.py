@@ -11,7 +11,7 @@ import pytest
 from false_alarms import Estimate, assert_precise, assert_same_mean, fresh
 from scattering_scenes import Pencils, mivol, rough_grid
 
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 
 GRID = "smoke.interior_medium.sigma_t.data"
 BATCHES = 16

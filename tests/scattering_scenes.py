@@ -12,7 +12,7 @@ import oracle_scattering as twins
 import pytest
 from false_alarms import Estimate, assert_precise, assert_same_mean, difference, fresh, over_pixels
 
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import as_float32, box_of, camera, centred, film, grid_volume, medium, pencil, pixel_rays
 
 KINDS = {"stock": ("heterogeneous", "gridvolume"), "own": ("mivol_medium", "mivol_voxels")}

@@ -41,8 +41,8 @@ from mivol.points.cloud import PointCloud, read_points, write_points
 from mivol.points.gaussian_files import read_gaussians, write_gaussians
 from mivol.report import record
 from mivol.report.page import write_page
-from mivol.validate.moments import Moments
 from mivol.validate.reference_file import ReferenceResult, read_checkpoint, read_reference, write_checkpoint, write_reference
+from mivol.validate.statistics import Moments
 from mivol.validate.trust import Doubt
 
 ROOT = Path(__file__).resolve().parents[1]

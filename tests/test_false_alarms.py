@@ -28,7 +28,7 @@ from false_alarms import (
     over_pixels,
 )
 
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 
 TESTS = Path(__file__).parent
 

@@ -8,7 +8,7 @@ import scattering_scenes as small
 from scattering_scenes import PLACE, assert_same_images, close_up, moments, point, rough_grid, spot, sun, volpath
 
 import scenes
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import affine, grid_volume, medium, transform
 
 LEAK = 1e-4

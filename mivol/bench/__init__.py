@@ -8,6 +8,6 @@ No other room of mivol imports this room, except ``cli/``.
 A new study is one file in ``studies/`` with a module docstring, whose first line is a question, and a constant ``STUDY``, its
 only public name. Bars on single figures are declared (:class:`~mivol.bench.harness.bars.Promise`).
 
-Shared: ``harness`` (timing, contests, bars, command line, figures), ``extinctions`` and ``scenes`` (volumes and lights),
-``reference_walk`` (rays through a volume; the rate of this walk measures the speed of a machine).
+Shared: ``harness`` (contests, bars, command line, figures), ``scenes`` (volumes, lights, and a walk of rays whose rate measures
+the speed of a machine) and ``photo_fits``.
 """

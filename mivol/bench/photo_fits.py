@@ -1,6 +1,6 @@
 """Fits of photographs as ``mivol optimize`` makes them: quality of held-out views, time on the reference machine, memory.
 
-Conventions. Times are processor time, converted to seconds of the machine of :mod:`mivol.bench.reference_walk`. The walk is
+Conventions. Times are processor time, converted to seconds of the machine of :mod:`mivol.bench.scenes`. The walk is
 timed before and after each fit. Memory is the largest memory of Dr.Jit, without the photographs. Views are judged over white.
 """
 
@@ -19,11 +19,10 @@ import mitsuba as mi
 import numpy as np
 
 from mivol import config
-from mivol.bench.extinctions import CHECKOUT, DATA
 from mivol.bench.harness.bars import say
+from mivol.bench.harness.contests import Stopwatch
 from mivol.bench.harness.study import Size, amount
-from mivol.bench.harness.timing import Stopwatch
-from mivol.bench.reference_walk import measure_walk_rate, reference_seconds
+from mivol.bench.scenes import CHECKOUT, DATA, measure_walk_rate, reference_seconds
 from mivol.errors import MivolError
 from mivol.experiments import gaussian_fit
 from mivol.experiments.field_fit import adapt_plan, make_batches, make_plan

@@ -1,40 +1,159 @@
-"""Scenes of stock plugins for all renderers: a box with an extinction, a camera of the tutorial, and lights; gradients.
+"""Volumes, scenes and rays of the studies: the tutorial's smoke and other volumes, scenes of stock plugins, a walk of rays.
 
-Conventions. The box is [-1, 1]^3. A light is a function that returns the changed parts of a scene: ``emitter``, and ``phase``
-of the medium.
-"""
+Conventions. A volume is (Z, Y, X) float32 [1/length] at voxel centres of the box [-1, 1]^3. Files come from MIVOL_DATA
+(default: shared/data beside the checkout). A made-up volume of the same size replaces a missing file, and ``origin``, which
+the JSON holds, says so. A light is a function that returns the changed parts of a scene: ``emitter``, and ``phase`` of the
+medium.
+
+Rays are in world space. Times of long fits are given for a machine that walks ``REFERENCE_RATE`` rays per second through the
+smoke of the tutorial. The rate of this machine is measured in the same run, so other work on the machine changes both times
+alike."""
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.extinctions import TO_WORLD
+from mivol.bench.harness.contests import Contestant, race
+from mivol.fields.procedural import make_procedural
+from mivol.files import read_volume
+from mivol.optim.events import upsample
+from mivol.transport.media.grid_integral import integrate_tau
+from mivol.transport.traversal.grid_blocks import find_empty_distances
+from mivol.transport.traversal.lattice import Lattice
 
 __all__ = [
+    "CHECKOUT",
+    "DATA",
     "DENSITY",
+    "REFERENCE_RATE",
+    "TO_WORLD",
+    "TUTORIAL_SCALE",
+    "Extinction",
+    "GridRays",
     "ParameterGradient",
+    "as_dense_as_smoke",
     "box_scene",
     "camera",
+    "camera_rays",
     "constant_light",
+    "ct_scan",
     "directional_light",
     "emitter_inside",
+    "fine_smoke",
     "glass_under_a_sky",
+    "les_cloud",
+    "made_up",
     "make_integrator",
     "map_directions",
+    "measure_walk_rate",
     "milk_in_a_glass",
     "milky_glass",
     "perspective",
     "point_light",
+    "reference_seconds",
+    "reference_walk",
+    "smoke",
     "square_error",
     "sun_and_sky",
     "sun_before_the_camera",
+    "threads_in_space",
 ]
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+DATA = Path(os.environ.get("MIVOL_DATA", CHECKOUT.parent / "shared" / "data"))
+
+TO_WORLD = np.array([[2, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]], np.float64)
+"""Transform from the unit cube to [-1, 1]^3, the box of every volume, as in the tutorial."""
+
+TUTORIAL_SCALE = 40.0
+"""Factor on the smoke in the tutorial; optical depths reach 65."""
+
+
+class Extinction(NamedTuple):
+    """An extinction (Z, Y, X) float32 [1/length] and its origin."""
+
+    values: np.ndarray
+    origin: str
+
+    def __str__(self) -> str:
+        return f"{'x'.join(map(str, self.values.shape[::-1]))}, {self.origin}"
+
+
+def smoke() -> Extinction:
+    """The smoke of the tutorial at its density, or made-up smoke of the same size."""
+    path = DATA / "volumes_vol" / "tutorials_volume.vol"
+    if path.is_file():
+        return Extinction(np.float32(TUTORIAL_SCALE) * read_volume(path, frame="unit").values[..., 0], "Mitsuba tutorial, x 40")
+    return made_up((53, 45, 44), peak=1.85 * TUTORIAL_SCALE)
+
+
+def fine_smoke(res: int) -> Extinction:
+    """The smoke upsampled to res^3 voxels."""
+    coarse = smoke()
+    fine = upsample(mi.TensorXf(np.ascontiguousarray(coarse.values[..., None])), (res,) * 3)
+    return Extinction(np.array(fine)[..., 0], f"{coarse.origin}, upsampled")
+
+
+def made_up(shape: tuple[int, int, int], peak: float, why: str = "no data folder") -> Extinction:
+    """Made-up soft blobs and filaments (Z, Y, X) with the seed 0; ``why`` is the reason in their origin."""
+    return Extinction(make_procedural("tangle", shape, 0, peak)[..., 0], f"procedural ({why})")
+
+
+def ct_scan(res: int) -> Extinction:
+    """The CT scan of a bonsai at 256^3 voxels, 0 to 2 [1/length]; a made-up volume at another resolution."""
+    path = DATA / "ct_mri" / "bonsai.vti"
+    if res == 256 and path.is_file():
+        values = read_volume(path, frame="unit").values[..., 0]
+        return Extinction(values * np.float32(2 / values.max()), "bonsai CT")
+    return made_up((res,) * 3, 2.0, "no data folder" if res == 256 else "quick")
+
+
+def threads_in_space(res: int) -> Extinction:
+    """Thin curved threads in 1 % of res^3 voxels; all other voxels are exactly 0."""
+    rng = np.random.default_rng(0)
+    values = np.zeros((res,) * 3, np.float32)
+    offsets = np.stack(np.meshgrid(*[np.arange(-3, 4)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    stamp = np.maximum(0, 1 - np.sum(offsets**2, axis=1) / 10).astype(np.float32)
+    offsets, stamp = offsets[stamp > 0], stamp[stamp > 0]
+    s = np.linspace(0, 2 * np.pi, 2 * res)[:, None]
+    while np.count_nonzero(values) < 0.01 * values.size:
+        a, b, c = rng.uniform(-0.3, 0.3, (3, 3))
+        curve = 0.5 + a * np.cos(s) + b * np.sin(s) + c * np.cos(2 * s) / 2
+        nodes = np.clip(np.rint(curve * res).astype(int)[:, None] + offsets, 0, res - 1)
+        np.maximum.at(values, tuple(nodes.reshape(-1, 3).T), np.tile(stamp, len(curve)))
+    return Extinction(20 * values, f"made-up threads, {np.count_nonzero(values) / values.size:.1%} of the voxels not 0")
+
+
+def les_cloud() -> Extinction:
+    """A cloud of a large-eddy simulation, stretched to the box; its optical depth along the vertical stays the same."""
+    path = DATA / "clouds_les" / "rico32x37x26.txt"
+    if not path.is_file():
+        return made_up((26, 37, 32), TUTORIAL_SCALE)
+    cloud = read_volume(path)
+    height = np.linalg.norm(cloud.to_world[:3, 2])
+    return Extinction(cloud.values[..., 0] * np.float32(height / 2), "LES cloud (RICO), stretched to a cube")
+
+
+def as_dense_as_smoke(volume: Extinction) -> Extinction:
+    """Scale a volume to the largest extinction of the smoke, and empty its outermost voxels.
+
+    Mitsuba continues rays (1 + |p|) 9e-5 behind a boundary. A medium that touches the boundary loses this skin, which holds 2 %
+    of the light at such an extinction (measured by quadrature in float64, which agrees with mivol).
+    """
+    values = np.pad(volume.values[1:-1, 1:-1, 1:-1], 1)
+    return Extinction(values * np.float32(smoke().values.max() / values.max()), f"{volume.origin}, as dense as the smoke")
+
+
+# -- Scenes ------------------------------------------------------------------------------------------------------------
 
 
 def perspective(side: int) -> dict:
@@ -251,3 +370,80 @@ class ParameterGradient:
 def square_error(target: mi.TensorXf) -> Callable[[mi.TensorXf], mi.Float]:
     """The mean squared difference of an image to a target."""
     return lambda image: dr.mean(dr.square(image - target), axis=None)
+
+
+# -- Rays through a volume ---------------------------------------------------------------------------------------------
+
+REFERENCE_RATE = 25e6
+"""Rate of the reference machine [rays/s]."""
+
+ROUNDS = 8
+"""Walks of which the median is taken."""
+
+
+@dataclass
+class GridRays:
+    """An extinction grid in the box, and rays.
+
+    Attributes:
+        values: (Z, Y, X) [1/length].
+        o, d: evaluated origins and directions, float32.
+    """
+
+    values: np.ndarray
+    o: mi.Point3f
+    d: mi.Vector3f
+
+    def __post_init__(self) -> None:
+        self.tensor = mi.TensorXf(np.ascontiguousarray(self.values[..., None]))
+        self.n = dr.width(self.d)
+
+    def lattice(self, skip_empty: bool = False) -> Lattice:
+        """Lattice of the grid; ``skip_empty`` lets rays leap over empty blocks."""
+        return Lattice(self.tensor, TO_WORLD, find_empty_distances(self.tensor) if skip_empty else None)
+
+    def optical_depths(self, skip_empty: bool = False) -> Contestant:
+        """Contestant that integrates the optical depth of each ray by mivol."""
+        lattice = self.lattice(skip_empty)
+        return lambda _: integrate_tau(lattice, self.o, self.d)
+
+    def select(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Indices, origins and directions of evenly spaced rays: (m,), (m, 3), (m, 3) float64."""
+        index = np.linspace(0, self.n - 1, min(count, self.n)).astype(int)
+        return index, np.array(self.o).T[index].astype(np.float64), np.array(self.d).T[index].astype(np.float64)
+
+
+def camera_rays(side: int, pixels: np.ndarray | None = None, k: int = 1) -> tuple[mi.Point3f, mi.Vector3f]:
+    """Rays through the centres of the k x k parts of each pixel, row by row.
+
+    Args:
+        side: edge of the image [pixels].
+        pixels: indices of pixels; None: all.
+        k: parts of a pixel along an axis.
+    """
+    pixels = (np.arange(side * side) if pixels is None else pixels)[:, None, None]
+    part = (np.arange(k) + 0.5) / k
+    shape = (len(pixels), k, k)
+    x = np.broadcast_to(pixels % side + part, shape).ravel() / side
+    y = np.broadcast_to(pixels // side + part[:, None], shape).ravel() / side
+    at = mi.Point2f(np.float32(x), np.float32(y))
+    ray, _ = mi.load_dict(perspective(side)).sample_ray(0.0, 0.5, at, mi.Point2f(0.5))
+    o, d = mi.Point3f(ray.o) + dr.zeros(mi.Point3f, dr.width(ray.d)), mi.Vector3f(ray.d)
+    dr.eval(o, d)
+    return o, d
+
+
+def reference_walk(side: int) -> Contestant:
+    """Contestant that walks the camera rays of an image through the smoke; ``side`` squared rays."""
+    return GridRays(smoke().values, *camera_rays(side)).optical_depths()
+
+
+def measure_walk_rate(side: int) -> float:
+    """Rays per second of the reference walk on all threads, by processor time."""
+    walk = race({"walk": reference_walk(side)}, ROUNDS)["walk"]
+    return side**2 * dr.thread_count() / float(np.median(walk.processor))
+
+
+def reference_seconds(processor: float, rate: float) -> float:
+    """Convert processor time of all threads to seconds of the reference machine; ``rate`` is the rate of this machine."""
+    return processor / dr.thread_count() * rate / REFERENCE_RATE

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import mivol
-from mivol.cli.convert import convert
 from mivol.cli.flags import (
     convert_flags,
     describe_settings,
@@ -32,7 +31,7 @@ from mivol.cli.flags import (
     validate_flags,
     view_flags,
 )
-from mivol.cli.inputs import draft_scan_of, explain, load_experiment, load_named_scene, parse_defines
+from mivol.cli.inputs import convert, draft_scan_of, explain, load_experiment, load_named_scene, parse_defines
 from mivol.errors import MivolError, MivolWarning
 from mivol.optim.interrupt import Signals
 
@@ -384,7 +383,7 @@ def view(arguments: argparse.Namespace) -> None:
 
     from mivol.back_end import choose_back_end
     from mivol.view.page import Page, check_viser, serve
-    from mivol.view.runs import open_subject
+    from mivol.view.subjects import open_subject
 
     check_viser()
     choose_back_end(arguments.mode, arguments.threads)

@@ -23,7 +23,7 @@ from mivol.cluster.workplace import Workplace
 from mivol.experiments.render import Passes, choose_integrator, render_in_turn
 from mivol.experiments.run_folder import SECONDS_BETWEEN_PAGES
 from mivol.optim.interrupt import InterruptGuard
-from mivol.report.sweep_page import SweepNews, SweepRow, write_sweep_page
+from mivol.report.page import SweepNews, SweepRow, write_sweep_page
 from mivol.scene.load import LoadedScene
 from mivol.scene.sensors import find_sensor
 from mivol.validate.reference import PATHS_PER_PASS, Complete, PreparedReference, ReferenceResult, RenderSetup

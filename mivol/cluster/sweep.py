@@ -29,8 +29,8 @@ from mivol.experiments.sweep import Execute, Sweep, SweepRun, Tell, is_fault_of_
 from mivol.files.atomic import disk_faults, lock_folder
 from mivol.optim.interrupt import Interrupted, InterruptGuard
 from mivol.optim.loop import Fit
+from mivol.report.page import SweepNews
 from mivol.report.record import RECORD
-from mivol.report.sweep_page import SweepNews
 
 T = TypeVar("T")
 

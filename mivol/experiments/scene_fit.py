@@ -65,7 +65,7 @@ from mivol.scene.survey import survey_scene
 from mivol.scene_graph import traverse
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Settings
 from mivol.validate.metrics import nrmse, psnr
-from mivol.validate.moments import BATCHES, Moments
+from mivol.validate.statistics import BATCHES, Moments
 
 REHEARSAL_SPP = 2
 """Largest number of samples per pixel in the derivative taken by ``mivol explain``; a noisy loss needs pairs."""

@@ -29,8 +29,8 @@ from mivol.experiments.fit_kind import NullProgress, Progress, RunContext
 from mivol.experiments.kinds import run_experiment
 from mivol.experiments.run_folder import CHECKPOINT, SECONDS_BETWEEN_PAGES
 from mivol.files.atomic import disk_faults, lock_folder, write_whole_text
+from mivol.report.page import SweepNews, SweepRow, write_sweep_page
 from mivol.report.record import RECORD, find_quantity, read_record
-from mivol.report.sweep_page import SweepNews, SweepRow, write_sweep_page
 
 STATE, TABLE = "sweep.json", "sweep.csv"
 

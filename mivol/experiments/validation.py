@@ -30,10 +30,9 @@ from mivol.scene.explain import describe_light
 from mivol.scene.load import LoadedScene
 from mivol.scene.sensors import find_sensor
 from mivol.scene_graph import traverse
-from mivol.validate.moments import BATCHES, Moments
 from mivol.validate.reference import Complete, complete_quietly, prepare_reference
 from mivol.validate.reference_file import Comparison, ReferenceResult, compare
-from mivol.validate.statistics import Estimate, Significance, effective_dof, z_bound
+from mivol.validate.statistics import BATCHES, Estimate, Moments, Significance, effective_dof, z_bound
 from mivol.validate.trust import Doubt, find_doubts
 
 AGREES, DIFFERS, UNTRUSTED = 0, 3, 4

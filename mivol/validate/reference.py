@@ -31,7 +31,6 @@ from mivol.photos.transforms import write_transforms
 from mivol.scene.description import content_hash
 from mivol.scene.load import LoadedScene, SceneSource, load_scene
 from mivol.scene.sensors import check_film, find_sensor, to_camera
-from mivol.validate.moments import Moments
 from mivol.validate.reference_file import (
     ReferenceResult,
     check_identity,
@@ -45,6 +44,7 @@ from mivol.validate.reference_file import (
     write_checkpoint,
     write_reference,
 )
+from mivol.validate.statistics import Moments
 from mivol.validate.trust import Doubt, RgbExtinction, find_doubts, find_rgb_extinctions, use_channel
 
 # Mitsuba's forward integrators for media.

@@ -30,8 +30,16 @@ from mivol.files.atomic import write_whole
 from mivol.files.image_files import read_exr, write_exr
 from mivol.files.npy import read_archive
 from mivol.validate.metrics import nrmse, psnr
-from mivol.validate.moments import Moments
-from mivol.validate.statistics import Bias, Estimate, Significance, estimate_bias, smallest_detectable_bias, z_bound, z_image
+from mivol.validate.statistics import (
+    Bias,
+    Estimate,
+    Moments,
+    Significance,
+    estimate_bias,
+    smallest_detectable_bias,
+    z_bound,
+    z_image,
+)
 from mivol.validate.trust import Doubt
 
 

@@ -18,7 +18,7 @@ from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS, depth_two_error, sample
 from mivol.scene.needs import mean_cosine
 from mivol.transport.media.medium_view import view_medium
 from mivol.transport.traversal.box import Box
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import FRAMES, affine, ball_of, medium, refused, rotation
 
 ROUNDING = 5e-4

@@ -20,7 +20,7 @@ from mivol.transport.estimators.lighting.emission_sampling import (
 )
 from mivol.transport.media.body import Body
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import affine, box_of, grid_volume, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

@@ -21,7 +21,7 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.event import DirectionSamples, NextDirection, PathEvent, sample_next_direction
 from mivol.transport.traversal.rays import point_along
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import box_of, camera, centred, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

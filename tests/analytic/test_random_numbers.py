@@ -11,7 +11,7 @@ import pytest
 from false_alarms import assert_same_mean, fresh
 
 from mivol.transport.traversal.random_numbers import SpreadSampler, draw_pcg32, seed_pcg32
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

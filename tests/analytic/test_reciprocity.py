@@ -9,8 +9,7 @@ from false_alarms import assert_precise, assert_same_mean, difference, fresh
 from scattering_scenes import rough_grid, smoke
 
 import scenes
-from mivol.validate.moments import Moments
-from mivol.validate.statistics import Estimate
+from mivol.validate.statistics import Estimate, Moments
 
 ALONG, SHONE = [0.2, 1.0, -0.3], [0.9, -0.1, -0.6]
 """Where the camera looks, and where the light travels."""

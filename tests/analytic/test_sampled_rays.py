@@ -22,7 +22,7 @@ from mivol.transport.line_integrals.sampled_rays import (
     vjp_samples,
 )
 from mivol.transport.traversal.occupancy import list_cells
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 
 RES = (8, 8, 8)
 RAYS = 200

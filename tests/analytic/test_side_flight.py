@@ -32,7 +32,7 @@ from mivol.transport.path.side_flight import (
     weigh_emitter_sample,
 )
 from mivol.transport.traversal.random_numbers import draw_state
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import ball_of, camera, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

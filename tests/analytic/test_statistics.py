@@ -9,13 +9,14 @@ from scipy.special import erfc, stdtr
 from scipy.stats import binom, norm
 
 from mivol.errors import MivolError
-from mivol.validate.moments import Moments, average_tiles
 from mivol.validate.statistics import (
     FAMILIES,
     Estimate,
+    Moments,
     Significance,
     assert_same_bounded_mean,
     assert_same_mean,
+    average_tiles,
     bounded_p_value,
     effective_dof,
     estimate_bias,

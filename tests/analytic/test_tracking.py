@@ -36,7 +36,7 @@ from mivol.transport.traversal.grid_blocks import find_block_ranges
 from mivol.transport.traversal.lattice import Lattice, clip_to_grid
 from mivol.transport.traversal.random_numbers import SpreadSampler, draw_pcg32, seed_pcg32
 from mivol.transport.traversal.rays import FineRay
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import as_float32, make_lattice, media_of, refused
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

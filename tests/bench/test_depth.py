@@ -12,7 +12,7 @@ from false_alarms import Estimate, assert_same_mean, assert_same_variance, fresh
 from mivol.bench.studies import depth as study
 from mivol.scene import depth_two
 from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 
 ROUNDING = 5e-4
 """Of a table of three digits."""

@@ -12,11 +12,9 @@ import pytest
 from bench_figures import drawn
 from readable_figures import assert_readable
 
-from mivol.bench.harness.contests import Contest
-from mivol.bench.harness.timing import Timing
+from mivol.bench.harness.contests import Contest, Timing
 from mivol.bench.studies import everyday
-from mivol.bench.studies.everyday import STUDY, EverydaySize, measure_gradients, measure_images
-from mivol.bench.studies.everyday.scenes import SCENES
+from mivol.bench.studies.everyday import SCENES, STUDY, EverydaySize, measure_gradients, measure_images
 from mivol.errors import MivolError
 
 TINY = replace(EverydaySize.quick(), scenes=("jade_null_sun",), side=2, spp=4, rounds=4)

@@ -11,7 +11,7 @@ from false_alarms import assert_precise, assert_same_mean, fresh, over_pixels
 
 from mivol.bench.studies.gradients import CONSTANT, DEEP_LIGHTS, TABLES, make_deep_cases, twin
 from mivol.bench.studies.gradients.twin import Light, Twin
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 
 SIDE = 6
 NOISE = np.random.default_rng(2).uniform(0.5, 1.5, (3, 4, 5))

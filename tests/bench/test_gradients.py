@@ -14,8 +14,7 @@ import pytest
 from false_alarms import ALPHA, note
 
 from mivol.bench.harness import contests
-from mivol.bench.harness.contests import Contest
-from mivol.bench.harness.timing import Timing
+from mivol.bench.harness.contests import Contest, Timing
 from mivol.bench.scenes import square_error
 from mivol.bench.studies import gradients as study
 from mivol.bench.studies.gradients import (

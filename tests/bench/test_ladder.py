@@ -12,8 +12,7 @@ import pytest
 from bench_figures import drawn
 from readable_figures import assert_readable
 
-from mivol.bench.harness.contests import Contest
-from mivol.bench.harness.timing import Timing
+from mivol.bench.harness.contests import Contest, Timing
 from mivol.bench.studies import ladder
 from mivol.bench.studies.ladder import MODELS, STUDY, LadderSize, error_figures, root_mean_square
 

@@ -16,9 +16,8 @@ import pytest
 from false_alarms import assert_same_bounded_mean
 from oracle import tau_twin
 
-from mivol.bench.extinctions import TO_WORLD
-from mivol.bench.harness.timing import Timing
-from mivol.bench.reference_walk import GridRays, camera_rays
+from mivol.bench.harness.contests import Timing
+from mivol.bench.scenes import TO_WORLD, GridRays, camera_rays
 from mivol.bench.studies import optical_depth as study
 from mivol.bench.studies.optical_depth import (
     STUDY,

@@ -13,7 +13,7 @@ from bench_figures import drawn, kept
 from PIL import Image
 from readable_figures import assert_readable
 
-from mivol.bench.harness.timing import Timing
+from mivol.bench.harness.contests import Timing
 from mivol.bench.studies import points
 from mivol.experiments.gaussian_fit import make_start_cloud
 from mivol.photos.transforms import write_transforms

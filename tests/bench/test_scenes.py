@@ -9,18 +9,21 @@ import numpy as np
 import pytest
 from scene_numbers import add_up
 
-from mivol.bench import extinctions
-from mivol.bench.extinctions import (
+from mivol.bench import scenes
+from mivol.bench.scenes import (
     Extinction,
     as_dense_as_smoke,
+    box_scene,
     ct_scan,
     fine_smoke,
     les_cloud,
     made_up,
+    make_integrator,
+    point_light,
     smoke,
+    sun_and_sky,
     threads_in_space,
 )
-from mivol.bench.scenes import box_scene, make_integrator, point_light, sun_and_sky
 from mivol.bench.studies import multiple_scattering, random_scenes, single_scattering
 from mivol.bench.studies.gradients import CONTESTS, TABLES
 from mivol.bench.studies.ladder import MODELS
@@ -83,9 +86,9 @@ def test_scenes_of_the_benches_are_those_of_the_published_figures(variant_rgb: s
 
 def test_volumes_without_data(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, variant_rgb: str) -> None:
     """Made-up ones of the same sizes, which say so; what they are made of is the procedural fields' own test."""
-    monkeypatch.setattr(extinctions, "DATA", tmp_path)
+    monkeypatch.setattr(scenes, "DATA", tmp_path)
     constant = lambda kind, shape, seed, peak: np.full((*shape, 1), peak, np.float32)  # noqa: E731
-    monkeypatch.setattr(extinctions, "make_procedural", constant)
+    monkeypatch.setattr(scenes, "make_procedural", constant)
     assert str(smoke()) == "44x45x53, procedural (no data folder)"
     assert str(les_cloud()) == "32x37x26, procedural (no data folder)"
     result = ct_scan(8)
@@ -138,6 +141,6 @@ def test_a_made_up_volume_has_its_peak() -> None:
 
 def test_every_volume_fills_the_box(variant_rgb: str) -> None:
     """The unit cube's corners go to those of [-1, 1]^3."""
-    place = mi.ScalarTransform4f(np.float32(extinctions.TO_WORLD))
+    place = mi.ScalarTransform4f(np.float32(scenes.TO_WORLD))
     assert np.allclose(np.ravel(place @ mi.ScalarPoint3f(0, 0, 0)), -1)
     assert np.allclose(np.ravel(place @ mi.ScalarPoint3f(1, 1, 1)), 1)

@@ -16,8 +16,7 @@ import pytest
 from false_alarms import ALPHA, fresh, note
 
 from mivol.bench.harness import contests
-from mivol.bench.harness.contests import Contest
-from mivol.bench.harness.timing import Timing
+from mivol.bench.harness.contests import Contest, Timing
 from mivol.bench.scenes import box_scene, make_integrator, milk_in_a_glass
 from mivol.bench.studies import media_light, multiple_scattering
 from mivol.bench.studies import single_scattering as study

@@ -18,7 +18,7 @@ import pytest
 from scipy import stats
 from tiny_experiment import refused, run
 
-from mivol.bench.harness import catalogue, contests, timing
+from mivol.bench.harness import catalogue, contests
 from mivol.bench.harness.bars import (
     AT_LEAST,
     AT_MOST,
@@ -32,16 +32,19 @@ from mivol.bench.harness.bars import (
 from mivol.bench.harness.contests import (
     FALSE_ALARM,
     Contest,
+    Stopwatch,
+    Timing,
     compare_means,
     compete,
     find_samples,
     finite_or_none,
     mean_of_pixels,
     mean_of_rounds,
+    race,
+    ratio_of,
 )
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
 from mivol.bench.harness.study import Size, Study, SweptQuestion, amount, ask, without_arrays
-from mivol.bench.harness.timing import Stopwatch, Timing, race, ratio_of
 from mivol.errors import MivolError
 from mivol.report.figures import STYLE
 from mivol.validate.statistics import Estimate
@@ -306,10 +309,10 @@ def test_first_calls_count_their_kernels(variant_rgb: str) -> None:
     new = int.from_bytes(os.urandom(3), "big") / 2**24
     x = dr.arange(mi.Float, 1000)
     dr.eval(x)
-    first = timing.time_first_call(lambda _: dr.sin(x) * new + dr.cos(x))
+    first = contests.time_first_call(lambda _: dr.sin(x) * new + dr.cos(x))
     assert set(first) == {"seconds", "compile_seconds", "kernels_compiled", "kernels_from_disk"}
     assert first["kernels_compiled"] == 1
-    assert timing.time_first_call(lambda _: dr.sin(x) * new + dr.cos(x))["kernels_compiled"] == 0
+    assert contests.time_first_call(lambda _: dr.sin(x) * new + dr.cos(x))["kernels_compiled"] == 0
 
 
 def test_first_calls_add_up_what_the_compiler_took(monkeypatch: pytest.MonkeyPatch, variant_rgb: str) -> None:
@@ -318,7 +321,7 @@ def test_first_calls_add_up_what_the_compiler_took(monkeypatch: pytest.MonkeyPat
     kernel = {"type": jit, "codegen_time": 200.0, "backend_time": 300.0, "cache_hit": False, "cache_disk": False}
     result = [kernel, {**kernel, "cache_hit": True, "cache_disk": True}, {**kernel, "type": other}]
     monkeypatch.setattr(dr, "kernel_history", lambda: result)
-    first = timing.time_first_call(lambda _: mi.Float(1))
+    first = contests.time_first_call(lambda _: mi.Float(1))
     assert (first["compile_seconds"], first["kernels_compiled"], first["kernels_from_disk"]) == (1.0, 1, 1)
 
 
@@ -336,8 +339,8 @@ def test_ratios_are_medians_of_rounds() -> None:
 def test_a_stopwatch_adds_up_its_blocks(monkeypatch: pytest.MonkeyPatch, variant_rgb: str) -> None:
     """What stands between two blocks is not counted."""
     now = [0.0]
-    monkeypatch.setattr(timing.time, "process_time", lambda: 2 * now[0])
-    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(contests.time, "process_time", lambda: 2 * now[0])
+    monkeypatch.setattr(contests.time, "perf_counter", lambda: now[0])
     watch = Stopwatch()
     for inside, outside in ((1.0, 100.0), (2.0, 100.0)):
         with watch:
@@ -350,13 +353,13 @@ def test_the_fastest_call_counts() -> None:
     """Three calls, of 5, 2 and 4 seconds."""
     clock = iter([0.0, 5.0, 10.0, 12.0, 20.0, 24.0])
     calls = []
-    assert timing.fastest(lambda: calls.append(0), lambda: next(clock)) == 2
+    assert contests.fastest(lambda: calls.append(0), lambda: next(clock)) == 2
     assert len(calls) == 3
 
 
 def test_peak_memory_of_a_call(variant_rgb: str) -> None:
     """An array of 4 MB, which is freed when the call ends."""
-    assert timing.peak_bytes(lambda: dr.eval(dr.arange(mi.Float, 1 << 20) + 1)) >= 4 << 20
+    assert contests.peak_bytes(lambda: dr.eval(dr.arange(mi.Float, 1 << 20) + 1)) >= 4 << 20
 
 
 def test_a_figure_is_written_when_its_block_ends(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from mivol.bench.studies import viewer
 from mivol.files import read_volume
 from mivol.points import read_gaussians
-from mivol.view.runs import open_subject
+from mivol.view.subjects import open_subject
 
 
 @pytest.mark.parametrize("name", ["balls.ply", "field.npz", "volume.nrrd"])

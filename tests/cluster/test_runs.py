@@ -33,8 +33,8 @@ from mivol.experiments.run_folder import CHECKPOINT
 from mivol.experiments.sweep import plan_sweep, run_in_turn, run_sweep
 from mivol.files import read_volume
 from mivol.optim import checkpoint
+from mivol.report.page import SweepRow
 from mivol.report.record import RECORD, read_record
-from mivol.report.sweep_page import SweepRow
 from mivol.scene.load import load_scene
 from mivol.scene.sensors import Ring
 from mivol.validate.reference import render_photographs

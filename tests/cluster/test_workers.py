@@ -42,7 +42,7 @@ from mivol.experiments.field_fit import FieldFit
 from mivol.experiments.scan_fit import ScanFit
 from mivol.experiments.scene_fit import SceneFit
 from mivol.optim.scenes.views import View
-from mivol.report.sweep_page import SweepRow
+from mivol.report.page import SweepRow
 from mivol.scene.load import load_scene
 from mivol.validate.reference import prepare_reference, render_reference
 

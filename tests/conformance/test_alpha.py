@@ -8,7 +8,7 @@ import pytest
 from false_alarms import assert_precise, assert_same_mean, over_pixels
 from scattering_scenes import cases, fog, mivol, moments, rough_grid, smoke, volpath
 
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import ball_of, camera, film, medium, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb", "traced_balls")

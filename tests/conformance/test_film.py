@@ -25,7 +25,7 @@ import scenes
 from mivol.scene import plan, session
 from mivol.transport.path import film
 from mivol.transport.path.film import count_passes
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import box_of, camera, grid_volume, medium, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

@@ -12,7 +12,7 @@ from scattering_scenes import PLACE, aimed, close_up, fog, mivol, pencils, phase
 
 import scenes
 from mivol.transport.estimators.flights import free_flight
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import as_float32, ball_of, box_of, centred, grid_volume, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

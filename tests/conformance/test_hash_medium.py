@@ -16,7 +16,7 @@ from mivol.fields.hash_encoding import HashSizes
 from mivol.fields.hash_grid import HashField
 from mivol.fields.nerf import NerfField, NerfSizes
 from mivol.optim.photographs.sampled_problem import find_region
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import box_of, camera, medium
 
 SIZES = {"levels": 3, "log2_table": 7, "coarsest": 2, "finest": 8, "width": 8}

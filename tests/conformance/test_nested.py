@@ -9,7 +9,7 @@ import pytest
 from false_alarms import Estimate, assert_precise, assert_same_mean, difference, fresh, over_pixels
 from scattering_scenes import close_up, mivol, moments, rough_grid, smoke
 
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import ball_of, medium, pencil, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

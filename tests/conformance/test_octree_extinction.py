@@ -15,7 +15,7 @@ from octrees import random_octree
 from mivol.fields.field_files import write_field
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.octree_extinction import LeafField, OctreeExtinction, merge_voxels
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import box_of, camera, medium
 
 KEY = "box.interior_medium.sigma_t.data"

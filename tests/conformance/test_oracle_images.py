@@ -17,7 +17,7 @@ from false_alarms import Estimate, assert_precise, assert_same_mean, difference,
 from oracle import box_interval, overlap, pixel_means, sphere_interval, tau_scale, tau_twin
 from scattering_scenes import cases
 
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import (
     FRAMES,
     affine,

@@ -13,7 +13,7 @@ from false_alarms import ALPHA, assert_precise, assert_same_mean, fresh, note
 from scattering_scenes import cases
 
 from mivol.phase.table import Table
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import box_of, camera, render, sky
 
 ROOT = Path(__file__).parents[2]

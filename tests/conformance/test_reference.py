@@ -32,9 +32,9 @@ from mivol.files.image_files import read_exr, write_exr
 from mivol.photos import Camera, Lens, intrinsics, load_photos, project, rays
 from mivol.scene.sensors import Ring, to_camera, to_sensor
 from mivol.validate import reference
-from mivol.validate.moments import Moments
 from mivol.validate.reference import render_photographs, render_reference
 from mivol.validate.reference_file import ReferenceResult, compare, read_reference
+from mivol.validate.statistics import Moments
 from mivol.validate.trust import find_doubts
 
 SIZE = 8

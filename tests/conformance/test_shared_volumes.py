@@ -11,8 +11,8 @@ from false_alarms import assert_precise, assert_same_mean, difference, fresh
 from scattering_scenes import PLACE, assert_same_images, close_up, mivol, point, rough_grid
 
 from mivol.transport.media.medium_view import traverse_medium, view_medium
-from mivol.validate.moments import Moments
 from mivol.validate.reference import render_reference
+from mivol.validate.statistics import Moments
 from scenes import box_of, centred, grid_volume, medium, sky, transform
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

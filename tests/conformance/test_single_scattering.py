@@ -27,8 +27,8 @@ from scattering_scenes import PLACE, assert_same_images, close_up, mivol, moment
 from volpath_scenes import BARE, FOG, LEAK, RED, area, behind_a_mask, cube, floor, grid_in, lit, same, square, turn
 
 import scenes
-from mivol.validate.moments import Moments
 from mivol.validate.reference import render_reference
+from mivol.validate.statistics import Moments
 from scenes import as_float32, ball_of, box_of, centred, grid_volume, medium, rotation
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

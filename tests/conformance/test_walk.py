@@ -9,7 +9,7 @@ from false_alarms import Estimate, assert_apart, assert_precise, assert_same_mea
 from scattering_scenes import cases
 
 import scenes
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import ball_of, box_of, camera, grid_volume, medium, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

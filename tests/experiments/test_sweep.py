@@ -14,8 +14,8 @@ from tiny_experiment import PHOTOS, refused, run, write_experiment
 from mivol.errors import MivolError
 from mivol.experiments import sweep as module
 from mivol.experiments.sweep import Sweep, SweepRun, parse_over, plan_sweep, run_name, run_sweep
+from mivol.report.page import SweepNews, SweepRow, write_sweep_page
 from mivol.report.record import RunRecord, Table, write_record
-from mivol.report.sweep_page import SweepNews, SweepRow, write_sweep_page
 
 
 def test_values_of_the_command_line() -> None:

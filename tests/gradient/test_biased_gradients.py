@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from false_alarms import Estimate, assert_precise, assert_same_mean, difference, fresh
 
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"

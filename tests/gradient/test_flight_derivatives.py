@@ -38,7 +38,7 @@ from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.uniform_points import UniformPoint
 from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
 from mivol.transport.traversal.rays import FineRay
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import as_float32, ball_of, box_of, camera, grid_volume, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

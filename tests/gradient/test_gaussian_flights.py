@@ -13,8 +13,7 @@ from scipy.special import logit
 
 import scenes
 from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS
-from mivol.validate.moments import Moments
-from mivol.validate.statistics import Estimate
+from mivol.validate.statistics import Estimate, Moments
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

@@ -16,8 +16,7 @@ from scipy.special import logit
 
 from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, HARMONICS
 from mivol.points.gaussians import CONSTANT_HARMONIC
-from mivol.validate.moments import Moments
-from mivol.validate.statistics import Estimate
+from mivol.validate.statistics import Estimate, Moments
 
 pytestmark = pytest.mark.usefixtures("variant_rgb", "traced_balls")
 

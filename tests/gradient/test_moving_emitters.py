@@ -15,7 +15,7 @@ from scattering_gradients import BATCHES, assert_gradient, gradients, twin_diffe
 from scattering_scenes import PLACE, aimed, mivol, pencils, point, rough_grid, smoke, spot, sun
 
 import scenes
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import as_float32, box_of, grid_volume, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

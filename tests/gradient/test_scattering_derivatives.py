@@ -34,7 +34,7 @@ from scattering_scenes import PLACE, Pencils, aimed, fog, mivol, pencils, point,
 import scenes
 from mivol.transport.estimators.single_scattering.scattering_derivatives import _choose_shadow_ray
 from mivol.transport.media.ray_intervals import RaySegment
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 from scenes import as_float32, box_of, centred, grid_volume, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

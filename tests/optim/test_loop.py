@@ -29,7 +29,7 @@ from mivol.optim.scenes.scene_problem import SceneProblem, draw_views
 from mivol.optim.scenes.views import View, derive_seed, make_batches
 from mivol.optim.schedules import Cosine
 from mivol.optim.second_order import GaussNewton, Lbfgs, Packing, apply_inverse_hessian, conjugate_gradients
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 
 EPS = float(np.finfo(np.float32).eps)
 

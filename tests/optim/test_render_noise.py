@@ -24,7 +24,7 @@ from mivol.optim.parameters import Parameter
 from mivol.optim.scenes.render_noise import compare_with_reference, describe_noise, make_noise_check, split_samples
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import View
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 
 SIGMA, SEEN, SPP = 0.4, 0.6, 8
 T = math.exp(-2 * SIGMA)

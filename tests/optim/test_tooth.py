@@ -25,7 +25,7 @@ from mivol.tomography.phantoms import random_ellipsoids
 from mivol.tomography.preprocess import Transmission, correct_transmission, fit_light_drift, normalise_air, to_line_integrals
 from mivol.tomography.projector import Projector
 from mivol.tomography.rotation_axis import axis_from_mirrors, axis_from_moments, axis_from_reconstructions, find_axis
-from mivol.validate.moments import Moments
+from mivol.validate.statistics import Moments
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "tooth.py"
 

@@ -1,4 +1,4 @@
-"""The page without a browser: a server that notes what is asked of it, and a painter of flat pictures."""
+"""The page without a browser (a server that notes what is asked of it, a painter of flat pictures), and who may open it."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.photos.camera_path import HomeView
 from mivol.view import page as module
-from mivol.view.page import FRAMES_A_SECOND, READ_ONLY, Page
+from mivol.view.page import FRAMES_A_SECOND, READ_ONLY, Page, cookie_name, find_fault
 from mivol.view.subjects import Look
 from mivol.view.transfer import COLOUR_MAPS, Transfer
 
@@ -255,3 +256,53 @@ def test_a_crop_is_saved_and_faults_are_said(monkeypatch: pytest.MonkeyPatch, tm
     page.subject.title = "later"
     module.serve(page, iter([False, False, True]).__next__)
     assert page.server.handles["title"].content == "**later**" and not page.server.is_running
+
+
+# -- The gate ----------------------------------------------------------------------------------------------------------
+
+PORT, TOKEN = 8080, "a-token"
+OWN = {"Host": "127.0.0.1:8080"}
+
+
+@pytest.mark.parametrize(
+    ("path", "headers"),
+    [
+        ("/?token=a-token", OWN),
+        ("/?token=a-token", {"Host": "localhost:8080"}),
+        ("/", OWN | {"Cookie": f"other=1; {cookie_name(PORT)}=a-token"}),
+        ("/", OWN | {"Cookie": f"{cookie_name(PORT)}=a-token", "Origin": "http://127.0.0.1:8080"}),
+    ],
+)
+def test_requests_with_the_token_pass(path: str, headers: dict[str, str]) -> None:
+    assert find_fault(path, headers, TOKEN, PORT) == ""
+
+
+@pytest.mark.parametrize(
+    ("path", "headers", "word"),
+    [
+        ("/", OWN, "token"),
+        ("/?token=", OWN, "token"),
+        ("/?token=a-tokem", OWN, "token"),
+        ("/", OWN | {"Cookie": f"{cookie_name(8081)}=a-token"}, "token"),
+        ("/?token=a-token", {"Host": "evil.example:8080"}, "host"),
+        ("/?token=a-token", {"Host": "127.0.0.1:8081"}, "host"),
+        ("/?token=a-token", {}, "host"),
+        ("/?token=a-token", OWN | {"Origin": "http://evil.example"}, "another page"),
+        ("/?token=a-token", OWN | {"Origin": "null"}, "another page"),
+    ],
+)
+def test_other_requests_are_turned_away(path: str, headers: dict[str, str], word: str) -> None:
+    assert word in find_fault(path, headers, TOKEN, PORT)
+
+
+def test_viser_is_asked_for(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Before the path is looked at: the wheel alone names its extra."""
+    monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None)
+    assert main(["view", "nothing"]) == 1
+    assert 'pip install "mivol[viewer]"' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("port", [0, 70_000])
+def test_ports_that_no_server_has_are_refused(port: int) -> None:
+    with pytest.raises(MivolError, match="expected 1 to 65535"):
+        module.start_server(port, TOKEN)

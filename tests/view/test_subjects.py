@@ -16,8 +16,7 @@ from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_volume, write_volume
 from mivol.points import Gaussians, read_gaussians, write_gaussians
 from mivol.report.record import RunRecord, write_record
-from mivol.view.runs import RunSubject, find_model, open_subject
-from mivol.view.subjects import Look
+from mivol.view.subjects import Look, RunSubject, find_model, open_subject
 from mivol.view.transfer import Transfer
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

@@ -27,9 +27,19 @@ from pathlib import Path
 
 import numpy as np
 
-from mivol.bench.extinctions import Extinction, as_dense_as_smoke, fine_smoke, les_cloud, smoke, threads_in_space
 from mivol.bench.harness.figures import new_figure
-from mivol.bench.scenes import constant_light, directional_light, milk_in_a_glass, sun_and_sky
+from mivol.bench.scenes import (
+    Extinction,
+    as_dense_as_smoke,
+    constant_light,
+    directional_light,
+    fine_smoke,
+    les_cloud,
+    milk_in_a_glass,
+    smoke,
+    sun_and_sky,
+    threads_in_space,
+)
 from mivol.bench.studies.single_scattering import (
     PEERS,
     ContestSize,

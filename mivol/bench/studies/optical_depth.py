@@ -27,12 +27,21 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from mivol.bench.extinctions import TO_WORLD, Extinction, ct_scan, made_up, smoke, threads_in_space
 from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Promise
+from mivol.bench.harness.contests import Contestant, peak_bytes, race, ratio_of, time_call
 from mivol.bench.harness.study import Size, Study, amount
-from mivol.bench.harness.timing import Contestant, peak_bytes, race, ratio_of, time_call
-from mivol.bench.reference_walk import GridRays, camera_rays
-from mivol.bench.scenes import ParameterGradient, box_scene
+from mivol.bench.scenes import (
+    TO_WORLD,
+    Extinction,
+    GridRays,
+    ParameterGradient,
+    box_scene,
+    camera_rays,
+    ct_scan,
+    made_up,
+    smoke,
+    threads_in_space,
+)
 from mivol.report.figures import Series, plot_error_against_time
 from mivol.transport.media.grid_integral import NodeGradient, backproject_segment, integrate_tau
 from mivol.transport.traversal.grid_blocks import bound_blocks

@@ -25,14 +25,12 @@ import numpy as np
 from drjit.hashgrid import HashGridEncoding
 from matplotlib.ticker import MaxNLocator
 
-from mivol.bench.extinctions import TO_WORLD, smoke
 from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Promise, say_row
+from mivol.bench.harness.contests import Stopwatch, race, ratio_of
 from mivol.bench.harness.figures import new_figure, show_images
 from mivol.bench.harness.study import Study, amount, ask
-from mivol.bench.harness.timing import Stopwatch, race, ratio_of
 from mivol.bench.photo_fits import FittedProblem, PhotoSize, find_photographs, fit_photographs, prepare_fit, prepare_fit_in_time
-from mivol.bench.reference_walk import REFERENCE_RATE
-from mivol.bench.scenes import box_scene, constant_light, make_integrator
+from mivol.bench.scenes import REFERENCE_RATE, TO_WORLD, box_scene, constant_light, make_integrator, smoke
 from mivol.errors import MivolError
 from mivol.experiments import field_fit
 from mivol.experiments.field_conversion import compare_speed

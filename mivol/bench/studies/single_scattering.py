@@ -50,12 +50,24 @@ import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 
-from mivol.bench.extinctions import Extinction, as_dense_as_smoke, ct_scan, fine_smoke, les_cloud, smoke, threads_in_space
 from mivol.bench.harness.bars import AT_LEAST, Bar, Promise, judge_agreement, say_row
 from mivol.bench.harness.contests import BudgetSize, agreement_figures, contest_images, gain_figures, image_errors
 from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios, use_plain_ticks
 from mivol.bench.harness.study import Study, amount, ask
-from mivol.bench.scenes import box_scene, constant_light, make_integrator, point_light, sun_and_sky
+from mivol.bench.scenes import (
+    Extinction,
+    as_dense_as_smoke,
+    box_scene,
+    constant_light,
+    ct_scan,
+    fine_smoke,
+    les_cloud,
+    make_integrator,
+    point_light,
+    smoke,
+    sun_and_sky,
+    threads_in_space,
+)
 
 ALBEDO = 0.75
 PEERS = ("volpath", "prbvolpath")

@@ -28,12 +28,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.extinctions import DATA, TO_WORLD, threads_in_space
 from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, Promise, judge_agreement
-from mivol.bench.harness.contests import agreement_figures, compete, finite_or_none, gain_figures, image_errors, render_method
+from mivol.bench.harness.contests import (
+    Contestant,
+    agreement_figures,
+    compete,
+    fastest,
+    finite_or_none,
+    gain_figures,
+    image_errors,
+    peak_bytes,
+    race,
+    render_method,
+)
 from mivol.bench.harness.study import Size, Study, amount
-from mivol.bench.harness.timing import Contestant, fastest, peak_bytes, race
-from mivol.bench.reference_walk import camera_rays
+from mivol.bench.scenes import DATA, TO_WORLD, camera_rays, threads_in_space
 from mivol.bench.studies.optical_depth import shuffle
 from mivol.errors import MivolError
 from mivol.fields.bricks import Bricks

@@ -49,15 +49,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.extinctions import smoke
 from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, judge, say_row
+from mivol.bench.harness.contests import Stopwatch
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
 from mivol.bench.harness.study import Question, Size, Study, amount, ask
-from mivol.bench.harness.timing import Stopwatch
 from mivol.bench.photo_fits import PhotoSize, find_photographs, prepare_fit
-from mivol.bench.scenes import box_scene
-from mivol.bench.studies.everyday import chosen_scenes
-from mivol.bench.studies.everyday.scenes import EverydayScene
+from mivol.bench.scenes import box_scene, smoke
+from mivol.bench.studies.everyday import EverydayScene, chosen_scenes
 from mivol.errors import MivolError
 from mivol.experiments.gaussian_fit import make_start_cloud
 from mivol.optim.first_order import Adam

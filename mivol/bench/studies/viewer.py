@@ -39,7 +39,7 @@ from mivol.points import Gaussians, write_gaussians
 from mivol.report.record import RECORD, read_record
 from mivol.threads import follow_program, run_child
 from mivol.view.painter import Painter
-from mivol.view.runs import open_subject
+from mivol.view.subjects import open_subject
 
 ASPECT = 4, 3
 

@@ -57,17 +57,20 @@ import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 
-from mivol.bench.extinctions import Extinction, fine_smoke, les_cloud, smoke
 from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, Promise, judge, judge_agreement, say_row
 from mivol.bench.harness.contests import SEED_STRIDE, Contest, compare_means, compete, finite_or_none, mean_of_rounds
 from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios
 from mivol.bench.harness.study import Study, amount, ask
 from mivol.bench.scenes import (
+    Extinction,
     ParameterGradient,
     constant_light,
     directional_light,
     emitter_inside,
+    fine_smoke,
     glass_under_a_sky,
+    les_cloud,
+    smoke,
     square_error,
     sun_and_sky,
     sun_before_the_camera,
@@ -75,8 +78,7 @@ from mivol.bench.scenes import (
 from mivol.bench.studies.gradients.tutorial import TutorialSize, measure_tutorial
 from mivol.bench.studies.gradients.twin import INTEGRATORS, Light, Twin
 from mivol.report.figures import MARKERS, SERIES
-from mivol.validate.moments import Moments
-from mivol.validate.statistics import Estimate
+from mivol.validate.statistics import Estimate, Moments
 
 DENSE = "sigma_t >= 1"
 """Region whose gradients are judged."""

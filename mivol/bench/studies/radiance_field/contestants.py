@@ -21,8 +21,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.extinctions import DATA, TO_WORLD
 from mivol.bench.harness.study import Size, amount
+from mivol.bench.scenes import DATA, TO_WORLD
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.loop import reconstruct
 from mivol.optim.photographs.field_view import render_view

@@ -35,12 +35,21 @@ import mitsuba as mi
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from mivol.bench.extinctions import as_dense_as_smoke, smoke, threads_in_space
 from mivol.bench.harness.bars import AT_MOST, Bar, judge, judge_agreement, say, say_row
 from mivol.bench.harness.contests import compare_means, mean_of_rounds
 from mivol.bench.harness.figures import new_figure
 from mivol.bench.harness.study import Size, Study, SweptQuestion, amount
-from mivol.bench.scenes import box_scene, constant_light, emitter_inside, make_integrator, milky_glass, sun_and_sky
+from mivol.bench.scenes import (
+    as_dense_as_smoke,
+    box_scene,
+    constant_light,
+    emitter_inside,
+    make_integrator,
+    milky_glass,
+    smoke,
+    sun_and_sky,
+    threads_in_space,
+)
 from mivol.bench.studies.random_scenes.generate import RandomScene, draw_built_scene, draw_scene
 from mivol.errors import MivolError
 from mivol.report.figures import SERIES

@@ -35,9 +35,9 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from mivol.bench.harness.bars import say, say_row
+from mivol.bench.harness.contests import Stopwatch, fastest
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
 from mivol.bench.harness.study import Size, Study, amount
-from mivol.bench.harness.timing import Stopwatch, fastest
 from mivol.bench.studies.tomography.peers import error_rows, measure_peers, measure_tooth, ratio_rows
 from mivol.files import read_volume
 from mivol.optim.projections.linear_problems import LeastSquares, SmoothedTV
