@@ -41,33 +41,40 @@ class Ball:
 
 
 def register() -> None:
-    """Register ``test_ball`` for the active variant: the shell of the field."""
+    """Register two shells of the field for the active variant. ``strangers_ball`` does not hand the field to mivol."""
 
-    class BallVolume(mi.Volume):
+    class StrangersBall(mi.Volume):
         def __init__(self, props: mi.Properties) -> None:
             given = props["sigma"]
             sigma = mi.Float(given) if isinstance(given, float) else mi.Color3f(*given)
             dr.make_opaque(sigma)
             centre = tuple(props.get("centre", mi.ScalarPoint3f(0)))
-            self.mivol_extinction = Ball(sigma, props.get("radius", 1.0), centre, props.get("slack", 1.0))
+            self.ball = Ball(sigma, props.get("radius", 1.0), centre, props.get("slack", 1.0))
             self.sigma = sigma
-            props["to_world"] = mi.ScalarTransform4f(self.mivol_extinction.to_world)
+            props["to_world"] = mi.ScalarTransform4f(self.ball.to_world)
             super().__init__(props)
 
         def eval(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Spectrum:
-            return mi.Spectrum(*self.mivol_extinction.eval(it.p, mi.Vector3f(0), active))
+            values = self.ball.eval(it.p, mi.Vector3f(0), active)
+            return mi.Spectrum(*values) if len(values) == 3 else mi.Spectrum(values[0])
 
         def eval_1(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Float:
-            return self.mivol_extinction.eval(it.p, mi.Vector3f(0), active)[0]
+            return self.ball.eval(it.p, mi.Vector3f(0), active)[0]
 
         def max(self) -> float:
-            return max(self.mivol_extinction.bound())
+            return max(self.ball.bound())
 
         def channel_count(self) -> int:
-            return self.mivol_extinction.channels
+            return self.ball.channels
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
-            for name, value in self.mivol_extinction.parameters().items():
+            for name, value in self.ball.parameters().items():
                 callback.put(name, value, mi.ParamFlags.Differentiable)
 
+    class BallVolume(StrangersBall):
+        def __init__(self, props: mi.Properties) -> None:
+            super().__init__(props)
+            self.mivol_extinction = self.ball
+
     mi.register_texture("test_ball", BallVolume)
+    mi.register_texture("strangers_ball", StrangersBall)

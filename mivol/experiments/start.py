@@ -53,7 +53,7 @@ from mivol.optim.scenes.views import View
 from mivol.photos import Photo
 from mivol.scene.sensors import to_camera
 from mivol.scene_graph import traverse
-from mivol.transport.media.medium_view import find_grid_place
+from mivol.transport.media.stock_grids import find_grid_place
 
 NUMBER_BYTES = 6 * 4
 """Memory per fitted number [byte]: value, copy in the scene, optimized real, derivative and two moments of the optimizer."""

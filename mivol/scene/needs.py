@@ -77,7 +77,7 @@ def find_needs(
     recording = is_recording()
     start = [] if sensor.get_medium() is None else [sensor.get_medium()]
     boundaries = (*survey.boundaries, *find_outside_media(start, survey.boundaries))
-    views = tuple(b.view(survey.places) for b in boundaries)
+    views = tuple(b.view(survey.grids) for b in boundaries)
     if differentiated is None:
         params = traverse(scene)
         differentiated = [(k, params.properties[k][2]) for k, v in list_values(params) if dr.grad_enabled(v)]
@@ -217,7 +217,7 @@ def _read_medium_facts(boundary: Boundary, view: MediumView, survey: SceneSurvey
         "emits": view.emits,
         "gaussians": sum(p.field.count for p in view.parts if isinstance(p, GaussianExtinction)),
         "leaves": sum(p.field.leaves for p in view.parts if isinstance(p, OctreeExtinction)),
-        "bounded": next((type(p.field).__name__ for p in view.parts if not p.exact_line), None),
+        "bounded": next((getattr(p.field, "kind", type(p.field).__name__) for p in view.parts if not p.exact_line), None),
     }
     if recording:
         # Use the last reading; a medium without a reading may scatter.
@@ -409,7 +409,7 @@ class Needs(ShapeFacts):
 
     def with_views(self, survey: SceneSurvey, asymmetries: list[mi.Float | None]) -> Needs:
         """The same facts with the media viewed anew: a recording reads their arrays from the scene, all but ``asymmetries``."""
-        views = (b.view(survey.places) for b in self.boundaries)
+        views = (b.view(survey.grids) for b in self.boundaries)
         return replace(self, views=tuple(replace(v, asymmetry=g) for v, g in zip(views, asymmetries, strict=True)))
 
     def make_media(self, scene: mi.Scene, bodies: Sequence[Body], size: float, tracer: mi.Scene | None) -> SceneMedia:

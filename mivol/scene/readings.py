@@ -38,9 +38,7 @@ from mivol.transport.traversal.grid_blocks import (
     place_blocks,
     tabulate_ranges,
 )
-from mivol.transport.traversal.grid_walk import NodeArray, corner_nodes, read_nodes
-from mivol.transport.traversal.interpolation import interpolate
-from mivol.transport.traversal.lattice import Lattice, locate_cell
+from mivol.transport.traversal.lattice import Lattice
 
 
 @dataclass
@@ -111,7 +109,7 @@ def read_extinction(part: ExactExtinction, survey: SceneSurvey, name: str) -> Gr
 
     Raises:
         MivolError: NaN or infinite values, or negative values of a radiance field whose activation takes none (the sentence
-            names the first bad voxel of a grid); a stock grid with another filter than trilinear or with unclamped borders.
+            names the first bad voxel of a grid).
     """
     array = dr.detach(part.lattice.values.array)
 
@@ -126,7 +124,6 @@ def read_extinction(part: ExactExtinction, survey: SceneSurvey, name: str) -> Gr
             floored = _clip_negative(part, survey, name)
             values = mi.TensorXf(floored, values.shape)
         if bricks is not None:
-            _check_look_up(part, survey, name)
             blocks = find_occupied_blocks(values, bricks)
             share = float(dr.count(blocks)[0]) / dr.width(blocks)
             return GridReading(blocks, share, float(dr.max(values.array)[0]), floored)
@@ -138,7 +135,6 @@ def read_extinction(part: ExactExtinction, survey: SceneSurvey, name: str) -> Gr
         if activation is None and low.min() < 0:
             floored = _clip_negative(part, survey, name)
             extremes, low, high = extremes.floor(), np.maximum(low, 0), np.maximum(high, 0)
-        _check_look_up(part, survey, name)
         bounds = np.maximum(-low, high).max(axis=0)
         filled = bounds > 0
         pattern = np.packbits(filled).tobytes()
@@ -181,56 +177,6 @@ def _check_stored_density(array: mi.Float, activation: Activation, name: str) ->
             f"the density of the field in {name} lies in [{low:.4g}, {high:.4g}] (or is NaN); {expected} are expected: clip it "
             "after each step."
         )
-
-
-LOOK_UP_POINTS = 2048
-"""Points for testing the interpolation of a stock grid: half in the outermost half voxels, half around nonzero voxels."""
-
-LOOK_UP_TOLERANCE = 0.02
-"""Largest deviation from trilinear interpolation, over the range of the 8 surrounding voxels. A rotated stock grid that does
-not
-fill its boundary deviates by 5e-6 of its size, a nearest-voxel filter by about 0.4."""
-
-
-def _check_look_up(part: ExactExtinction, survey: SceneSurvey, name: str) -> None:
-    """Refuse a stock grid with another filter or with unclamped borders. Mitsuba exposes neither setting, so values are
-    compared.
-    """
-    volume, lattice = part.volume, part.lattice
-    mixes = mi.is_monochromatic and lattice.channels > 1
-    if volume is None or volume.ptr in survey.looked_up or mixes:
-        return
-    rng, sizes = np.random.default_rng(0), np.array(lattice.res[::-1])
-    u, axis, border = (
-        rng.uniform(1e-3, 1 - 1e-3, (LOOK_UP_POINTS, 3)),
-        rng.integers(3, size=LOOK_UP_POINTS),
-        np.arange(LOOK_UP_POINTS // 2),
-    )
-    u[border, axis[border]] = rng.uniform(0.05, 0.45, len(border)) / sizes[axis[border]]
-    held = np.argwhere(np.array(lattice.values).any(axis=3))[:, ::-1]
-    if len(held):
-        chosen = held[rng.integers(len(held), size=LOOK_UP_POINTS - len(border))]
-        u[len(border) :] = np.clip((chosen + rng.uniform(0, 1, chosen.shape)) / sizes, 1e-3, 1 - 1e-3)
-    it = dr.zeros(mi.Interaction3f, LOOK_UP_POINTS)
-    it.p = lattice.to_world_points(mi.Vector3f(u.T.astype(np.float32)))
-    cell, frac, _ = locate_cell(lattice, it.p, mi.Vector3f(0, 0, 1), mi.Float(0))
-    values = [NodeArray(dr.detach(lattice.values.array), lattice.channels)]
-    corners, c = read_nodes(values, corner_nodes(cell, lattice, mi.Bool(True)), mi.Bool(True))[0], lattice.channels
-    expected, actual = [interpolate(row, frac) for row in corners], volume.eval_1(it) if c == 1 else volume.eval(it)
-    # One kernel: each conversion to NumPy would be a kernel of its own.
-    dr.eval(expected, actual, corners)
-    expected, actual = np.array([np.array(row) for row in expected]), np.array(actual).reshape(c, -1)
-    spread = np.ptp(np.array([[np.array(v) for v in row] for row in corners]), axis=1)
-    error, scale = np.abs(expected - actual), float(np.abs(expected).max())
-    groups = [*(border[axis[border] == a] for a in range(3)), slice(len(border), None)]
-    if any(error[:, s].sum() > LOOK_UP_TOLERANCE * spread[:, s].sum() + 1e-5 * scale * LOOK_UP_POINTS for s in groups):
-        raise MivolError(
-            f"{part.name} of the medium in {name} is a gridvolume with another filter_type than trilinear or another wrap_mode "
-            "than clamp: its values between voxels are not those that rays are integrated over; leave both at these, or "
-            "resample the grid."
-        )
-    if spread.any():
-        survey.looked_up.add(volume.ptr)
 
 
 @dataclass

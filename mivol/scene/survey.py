@@ -16,6 +16,7 @@ from mivol.scene_graph import traverse
 from mivol.transport.estimators.lighting.emitters import UNIFORM_EMITTER
 from mivol.transport.media.body import Body
 from mivol.transport.media.medium_view import MediumView, nested_field, view_medium
+from mivol.transport.media.stock_grids import StockGrids
 from mivol.transport.traversal.box import Box, fit_ball, fit_box
 
 MAX_FOLLOWED_SURFACES = 16
@@ -106,13 +107,12 @@ class SceneSurvey:
         marks: placement of each boundary, and of each surface with a box: the array of its vertices, or its box.
         size: diagonal of the box around all shapes [length].
         tracer: scene of the surfaces and traced boundaries alone; None to trace the whole scene.
-        looked_up: stock grids whose interpolation agrees with mivol's, by pointer.
         scatters: whether each medium scattered at the last reading, by name.
         values, numbers: results of reading arrays and constants (:mod:`mivol.scene.readings`).
         reads: keys of the values that the previous render and the present one have read.
         distances: distances of blocks to occupied blocks, with the pattern of these, by medium and part.
         recorded: kernels that read grids.
-        places: placements of grids (:func:`mivol.transport.media.medium_view.view_medium`).
+        grids: places and filters of stock grids.
         cosines: mean cosines of phase functions, by the name of the medium.
         warned: media and grids with a warning already given.
         misplaced: names of the grids of each medium that lie outside of its shapes.
@@ -131,13 +131,12 @@ class SceneSurvey:
     marks: tuple[tuple[mi.Shape, object], ...] = ()
     size: float = 1.0
     tracer: mi.Scene | None = None
-    looked_up: set = field(default_factory=set)
     scatters: dict = field(default_factory=dict)
     values: dict = field(default_factory=dict)
     reads: list[set] = field(default_factory=lambda: [set(), set()])
     distances: dict = field(default_factory=dict)
     recorded: RecordedFunctions = field(default_factory=RecordedFunctions)
-    places: dict = field(default_factory=dict)
+    grids: StockGrids = field(default_factory=StockGrids)
     numbers: dict = field(default_factory=dict)
     cosines: dict = field(default_factory=dict)
     warned: set = field(default_factory=set)
@@ -407,14 +406,14 @@ class Boundary:
     hole: Box | None = None
     around: OrientedBox | None = None
 
-    def view(self, places: dict) -> MediumView:
-        """View the medium as a sum of fields; ``places`` as in :func:`mivol.transport.media.medium_view.view_medium`.
+    def view(self, grids: StockGrids) -> MediumView:
+        """View the medium as a sum of fields; ``grids`` as in :func:`mivol.transport.media.medium_view.view_medium`.
 
         Raises:
             MivolError: a medium that mivol does not render.
         """
         box = None if self.box is None or self.box.is_round else self.box
-        return view_medium(self.medium, box, places, self.level)
+        return view_medium(self.medium, box, grids, self.level)
 
     def body(self, view: MediumView, estimates_shadows: bool = False) -> Body:
         """Place a view of the medium inside its boundary."""

@@ -28,8 +28,8 @@ def ball_plugin(variant_rgb: str) -> None:
     bounded_ball.register()
 
 
-def fog(sigma: float | list = 1.5, **more: object) -> dict:
-    ball = {"type": "test_ball", "sigma": sigma, **more}
+def fog(sigma: float | list = 1.5, kind: str = "test_ball", **more: object) -> dict:
+    ball = {"type": kind, "sigma": sigma, **more}
     return {"type": "mivol_medium", "sigma_t": ball, "scale": SCALE}
 
 
@@ -89,7 +89,8 @@ BOUNDARIES = {"a box": "cube", "a traced sphere": "sphere"}
 @pytest.mark.statistical
 @pytest.mark.parametrize("slack", [1.0, 3.0])
 @pytest.mark.parametrize("boundary", BOUNDARIES)
-def test_beer_lambert_through_a_ball(boundary: str, slack: float) -> None:
+@pytest.mark.parametrize("kind", ["test_ball", "strangers_ball"])
+def test_beer_lambert_through_a_ball(kind: str, boundary: str, slack: float) -> None:
     """Rationale: exp(-sigma chord) is known, and the estimator does not know the chord. Expected: means and derivatives by the
     extinction agree. A loose majorant costs look-ups and changes no mean.
 
@@ -97,7 +98,7 @@ def test_beer_lambert_through_a_ball(boundary: str, slack: float) -> None:
     standard errors.
     """
     chord = 2 * np.sqrt(0.8**2 - 0.5**2)
-    found = scene([0, -4, 0.5], [0, 0, 0.5], fog=shape(BOUNDARIES[boundary], fog(radius=0.8, slack=slack)))
+    found = scene([0, -4, 0.5], [0, 0, 0.5], fog=shape(BOUNDARIES[boundary], fog(kind=kind, radius=0.8, slack=slack)))
     image, tangent, _ = follow(found, ("sigma_t.sigma",), spp=4 * SPP)
     seen = SKY * np.exp(-1.5 * SCALE * chord)
     check(image[..., 0], seen, "the radiance")
@@ -116,10 +117,25 @@ def test_a_ball_that_glows() -> None:
 
 
 @pytest.mark.statistical
-def test_colours_and_the_scale_of_the_medium() -> None:
+def test_voxels_that_mitsuba_does_not_interpolate() -> None:
+    """A row of voxels with the filter nearest, along the line of sight: tau is their mean times the length of the row."""
+    values = np.random.default_rng(4).uniform(0.1, 1, (1, 7, 1, 1)).astype(np.float32)
+    grid = {"type": "gridvolume", "grid": mi.VolumeGrid(values), "filter_type": "nearest", "raw": True}
+    place = mi.ScalarTransform4f().translate(-1).scale(2)
+    medium = {"type": "heterogeneous", "albedo": 0.0, "sigma_t": grid | {"to_world": place}, "scale": SCALE}
+    image, tangent, _ = follow(scene([0, -4, 0], [0, 0, 0], fog=shape("cube", medium)), ("sigma_t.data",))
+    seen = SKY * np.exp(-2 * SCALE * values.mean(dtype=np.float64))
+    check(image[..., 0], seen, "the radiance")
+    check(tangent[..., 0], -2 * SCALE * seen, "the derivative by all voxels together")
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("kind", ["test_ball", "strangers_ball"])
+def test_colours_and_the_scale_of_the_medium(kind: str) -> None:
     """Each channel by itself, under a common majorant; the scale has a derivative like the field's own parameters."""
     sigma, chord = [0.3, 1.0, 2.0], 1.6
-    image, tangent, _ = follow(scene([0, -4, 0], [0, 0, 0], fog=shape("cube", fog(sigma, radius=0.8))), ("scale", "sigma"))
+    found = scene([0, -4, 0], [0, 0, 0], fog=shape("cube", fog(sigma, kind, radius=0.8)))
+    image, tangent, _ = follow(found, ("scale", "sigma"))
     for channel, own in enumerate(sigma):
         seen = SKY * np.exp(-own * SCALE * chord)
         check(image[..., channel], seen, f"the radiance of channel {channel}")

@@ -12,6 +12,7 @@ import pytest
 
 from mivol.fields.hash_density import HashDensity
 from mivol.fields.hash_encoding import HashSizes
+from mivol.fields.plugin_field import PluginField
 from mivol.fields.protocol import BOUNDED, EXACT_LINE, Field
 from mivol.fields.voxels import Voxels
 
@@ -35,11 +36,19 @@ def hash_density() -> HashDensity:
     return HashDensity(sizes, place, 2.0, tensors)
 
 
+def plugin_field(sigma: float | list[float]) -> PluginField:
+    bounded_ball.register()
+    ball = {"type": "strangers_ball", "sigma": sigma, "radius": 0.8, "centre": mi.ScalarPoint3f(0.1, 0.2, -0.3)}
+    return PluginField(mi.load_dict(ball))
+
+
 FIELDS: dict[str, tuple[Callable[[], Field], str]] = {
     "grey voxels": (lambda: voxels(1), EXACT_LINE),
     "rgb voxels": (lambda: voxels(3), EXACT_LINE),
     "a ball": (lambda: bounded_ball.Ball(dr.opaque(mi.Float, 1.5), 0.8, (0.1, 0.2, -0.3)), BOUNDED),
     "a hash grid": (hash_density, BOUNDED),
+    "a volume of another package": (lambda: plugin_field(1.5), BOUNDED),
+    "an rgb volume of another package": (lambda: plugin_field([1.2, 2, 3]), BOUNDED),
     "an rgb ball": (lambda: bounded_ball.Ball(mi.Color3f(0.2, 1, 3), 0.8, (0.1, 0.2, -0.3), 2.0), BOUNDED),
 }
 

@@ -80,43 +80,6 @@ def test_albedo_is_not_looked_up():
     assert lookups(kernels(scene_of(albedo=some), depth=1)) == plain
 
 
-def stock(values: np.ndarray, place: np.ndarray = PLACE, **more: object) -> mi.Scene:
-    """A stock grid in a box that is its own."""
-    return scene_of(sigma_t=grid_volume("gridvolume", values, place) | more, kind="heterogeneous", where=(place,))
-
-
-LONE = np.pad(values(), ((50, 50), (50, 50), (50, 50), (0, 0)))
-ROW = np.random.default_rng(2).uniform(0.1, 1, (1, 1, 90, 1))
-
-
-@pytest.mark.slow_for("rgb-nearest")
-@pytest.mark.parametrize("more", [{"filter_type": "nearest"}, {"wrap_mode": "repeat"}], ids=["nearest", "repeat"])
-@pytest.mark.parametrize("voxels", [values(), values(3), ROW, LONE], ids=["grey", "rgb", "a row", "few of many"])
-def test_grids_that_are_looked_up_otherwise_are_refused(voxels, more):
-    """A stock grid tells neither its filter nor its borders. Where all borders are 0 they are the same in any case."""
-    if voxels is LONE and "wrap_mode" in more:
-        scenes.render(stock(voxels, **more), {"type": "mivol", "max_depth": 1}, 1)
-        return
-    with refused("box is a gridvolume with another filter_type.*resample"):
-        scenes.render(stock(voxels, **more), {"type": "mivol", "max_depth": 1}, 1)
-
-
-def test_grids_that_are_looked_up_alike_are_taken():
-    """In turned boxes, with one voxel, with mirrored borders (which are clamped as far as a grid goes); constant at first."""
-    turned = scenes.centred(1.3 * scenes.rotation([1, 2, 3], 0.7), (90, 50, -3))
-    many = np.random.default_rng(1).uniform(0, 1, (70, 80, 90, 1))
-    for scene in (stock(many, turned), stock(values()[:1, :1, :1]), stock(values(), wrap_mode="mirror")):
-        scenes.render(scene, {"type": "mivol", "max_depth": 1}, 1)
-    scene = stock(np.full((3, 3, 3, 1), 0.7), filter_type="nearest")
-    integrator = mi.load_dict({"type": "mivol", "max_depth": 1})
-    scenes.render(scene, integrator, 1)
-    params = mi.traverse(scene)
-    params["box.interior_medium.sigma_t.data"] = scenes.tensor(values())
-    params.update()
-    with refused("another filter_type"):
-        scenes.render(scene, integrator, 1)
-
-
 def test_no_phase_function_and_no_light_sampling():
     """The kernels of any phase function and depth are the same, to the letter: none is in them."""
     plain = kernels(scene_of())

@@ -182,7 +182,7 @@ def make_noise_check(integrator: mi.Integrator, scene: mi.Scene) -> Callable[[],
         return lambda: False
 
     def scatters() -> bool:
-        views = ((b.view(survey.places), b.name) for b in survey.boundaries)
+        views = ((b.view(survey.grids), b.name) for b in survey.boundaries)
         return any(is_scattering(view, survey, name) for view, name in views)
 
     return scatters

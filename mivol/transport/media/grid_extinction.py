@@ -90,12 +90,10 @@ class GridExtinction(NodeValues):
     """A grid of extinction [1/length], grey or rgb (:class:`mivol.transport.media.extinction.ExactExtinction`).
 
     Attributes:
-        volume: the stock grid of these values, which may look up voxels in another way; None without a stock grid.
         rough: the means of blocks of voxels as a grid of their own, for drawing distances; None without one.
         floored: the values with 0 in place of negative values; None without negative values.
     """
 
-    volume: mi.Volume | None = None
     rough: GridExtinction | None = None
     floored: mi.Float | None = None
     activation: ClassVar[None] = None
@@ -103,8 +101,7 @@ class GridExtinction(NodeValues):
     def floor(self, floored: mi.Float) -> None:
         """Replace negative values by 0, with their derivatives as they are."""
         values = self.lattice.values
-        # Do not evaluate the stock grid from here on: the stock grid still interpolates negative values.
-        self.lattice.values, self.volume = mi.TensorXf(dr.replace_grad(floored, values.array), values.shape), None
+        self.lattice.values = mi.TensorXf(dr.replace_grad(floored, values.array), values.shape)
         self.floored = floored
 
     def integrate(self, interval: RayInterval, enough: mi.Float | None = None) -> list[mi.Float]:
@@ -171,7 +168,6 @@ class ActivatedGridExtinction(NodeValues):
     """
 
     activation: Activation
-    volume: ClassVar[None] = None
     rough: ClassVar[None] = None
 
     def integrate(self, interval: RayInterval, enough: mi.Float | None = None) -> list[mi.Float]:

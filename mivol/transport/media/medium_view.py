@@ -13,7 +13,6 @@ with their gradients.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 
 import drjit as dr
@@ -22,6 +21,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.fields.gaussian_field import GaussianField
+from mivol.fields.plugin_field import PluginField
 from mivol.fields.protocol import BOUNDED, Field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.kernel_recording import is_recording
@@ -30,6 +30,7 @@ from mivol.transport.media.extinction import BoundedExtinction, ConstantExtincti
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridExtinction
 from mivol.transport.media.octree_extinction import LeafField, OctreeExtinction
+from mivol.transport.media.stock_grids import StockGrids
 from mivol.transport.traversal.box import Box
 from mivol.transport.traversal.lattice import Lattice
 
@@ -116,15 +117,14 @@ ASYMMETRY = "phase_function.g"
 """Name of the ``g`` of a medium with Mitsuba's ``hg``, as in ``mi.traverse``."""
 
 
-def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | None = None, level: int = 0) -> MediumView:
+def view_medium(medium: mi.Medium, boundary: Box | None = None, grids: StockGrids | None = None, level: int = 0) -> MediumView:
     """View a medium as a sum of fields.
 
     Args:
-        medium: ``mivol_medium``, ``homogeneous`` or ``heterogeneous`` (over ``gridvolume``, ``constvolume`` or
-            ``mivol_voxels``).
+        medium: ``mivol_medium``, ``homogeneous`` or ``heterogeneous``, over volumes of Mitsuba, of mivol or of another package.
         boundary: the boundary, if the boundary is a box. Mitsuba prints the place of a stock grid to 6 digits only; a grid
             filling its boundary to these digits is put exactly there.
-        places: a cache of the places of grids, by volume and boundary, to read and to extend; by default empty.
+        grids: what is known of the stock grids, to read and to extend; by default nothing.
         level: level of a nested radiance field.
 
     Raises:
@@ -137,14 +137,9 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     children = find_children(medium)
     values = list_values(params)
     names = [n for n in ("sigma_t", "sigma_a", "sigma_s") if n in children]
-    places = {} if places is None else places
+    grids = StockGrids() if grids is None else grids
     scale = _read_scale(params["scale"]) if "scale" in params.properties else mi.Float(1)
-    parts = [
-        _field_part(name, children[name].mivol_extinction, scale)
-        if hasattr(children[name], "mivol_extinction")
-        else _part(name, params, children[name], kind, boundary, places)
-        for name in names
-    ]
+    parts = [_part(name, params, children[name], kind, scale, boundary, grids) for name in names]
     of_albedo = "sigma_s." if "sigma_s" in names else "albedo."
     own = {k: v for k, v in values if k.startswith(of_albedo)}
     # Of a grid, its values alone: not what they are made of (weights, a table), nor the numbers of bricks.
@@ -156,9 +151,13 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
         parts, albedo, emission_arrays = [_part_of_field(emission, level)], mi.Float(0), []
         if isinstance(parts[0], GaussianExtinction):
             emission = None  # their light is in their order along a ray: no function of place has it
-    light = [f for f in (emission_density, emission, albedo) if emission is not None or emission_density is not None]
-    emission_lattice = _emission_lattice(emission_density, light, boundary, places)
-    stock_boxes = {v.ptr: Box(_place(v, boundary, places)) for v in light if _repeats_border(v)}
+    fields = {"emission_density": emission_density, "emission": emission, "albedo": albedo}
+    fields = fields if emission is not None or emission_density is not None else {}
+    for name, field_of_light in fields.items():
+        _check_cells(name, field_of_light, boundary, grids)
+    light = list(fields.values())
+    emission_lattice = _emission_lattice(emission_density, light, boundary, grids)
+    stock_boxes = {v.ptr: Box(grids.place(v, boundary)) for v in light if _repeats_border(v)}
     numbers = {k.partition(".")[0]: v for k, v in values if k in ("scale", *(f"{n}.value.value" for n in names))}
     is_isotropic, asymmetry = _read_phase(medium)
     if asymmetry is not None:
@@ -243,16 +242,30 @@ def _part_of_field(volume: mi.Volume, level: int) -> ActivatedGridExtinction | G
     return ActivatedGridExtinction("sigma_t", lattice, volume.mivol_field.activation_function)
 
 
-def _emission_lattice(emission_density: object, others: list, boundary: Box | None, places: dict) -> Lattice | None:
+def _emission_lattice(emission_density: object, others: list, boundary: Box | None, grids: StockGrids) -> Lattice | None:
     """The grid of the emission density, or the finest grid of the other fields, as a lattice of zeros; None without a grid."""
-    grids = [v for v in others if _is_grid(v)]
-    lead = (
-        emission_density if _is_grid(emission_density) else max(grids, key=lambda v: int(np.prod(v.resolution())), default=None)
-    )
+    finest = max((v for v in others if _is_grid(v)), key=lambda v: int(np.prod(v.resolution())), default=None)
+    lead = emission_density if _is_grid(emission_density) else finest
     if lead is None:
         return None
     x, y, z = (int(n) for n in lead.resolution())
-    return Lattice(dr.zeros(mi.TensorXf, (z, y, x, 1)), _place(lead, boundary, places))
+    return Lattice(dr.zeros(mi.TensorXf, (z, y, x, 1)), grids.place(lead, boundary))
+
+
+def _check_cells(name: str, volume: object, boundary: Box | None, grids: StockGrids) -> None:
+    """Refuse a volume that the emission of a medium cannot be summed with: its values are not trilinear in the cells of a grid.
+
+    Raises:
+        MivolError: a volume of another package, or a stock grid with another filter or with borders that are not clamped.
+    """
+    if not _is_grid(volume) or hasattr(volume, "mivol_to_world") or hasattr(volume, "mivol_field"):
+        return
+    found = f"a volume {type(volume).__name__}"
+    if volume.class_name() == "GridVolume":
+        if grids.is_trilinear(volume, Lattice(_tensor(traverse(volume)["data"]), grids.place(volume, boundary))):
+            return
+        found = "a gridvolume with another filter_type than trilinear or another wrap_mode than clamp"
+    raise MivolError(f"the {name} of a medium that emits is {found}; expected a trilinear grid: sample it to a mivol_voxels.")
 
 
 def _is_grid(volume: object) -> bool:
@@ -262,14 +275,6 @@ def _is_grid(volume: object) -> bool:
 def _repeats_border(volume: object) -> bool:
     """Whether a volume repeats its border outside its own box, as stock grids do."""
     return _is_grid(volume) and not hasattr(volume, "mivol_to_world")
-
-
-def _place(volume: mi.Volume, boundary: Box | None, places: dict) -> np.ndarray:
-    """Place of a grid (4x4, unit cube to world), from the cache ``places`` or by :func:`find_grid_place`."""
-    key = (volume.ptr, None if boundary is None else boundary.to_world.tobytes())
-    if key not in places:
-        places[key] = find_grid_place(volume, boundary)
-    return places[key]
 
 
 def medium_kind(medium: mi.Medium) -> str:
@@ -327,65 +332,40 @@ def _field_part(
 
 
 def _part(
-    name: str, params: mi.SceneParameters, volume: mi.Volume, kind: str, boundary: Box | None, places: dict
+    name: str,
+    params: mi.SceneParameters,
+    volume: mi.Volume,
+    kind: str,
+    scale: mi.Float,
+    boundary: Box | None,
+    grids: StockGrids,
 ) -> Extinction:
-    """The part of an extinction under ``name`` among the parameters of a medium."""
+    """The part of an extinction under ``name`` among the parameters of a medium.
+
+    Volumes of Mitsuba and of mivol with trilinear values are walked cell by cell. Others are called at points.
+    """
+    if hasattr(volume, "mivol_extinction"):
+        return _field_part(name, volume.mivol_extinction, scale)
+    is_stock = volume.class_name() == "GridVolume"
+    if not (is_stock or volume.class_name() == "ConstVolume" or hasattr(volume, "mivol_to_world")):
+        return _field_part(name, PluginField(volume), scale)
     grid, constant = f"{name}.data", f"{name}.value.value"
     if grid in params.properties:
         bricks = getattr(volume, "mivol_bricks", None)
-        lattice = Lattice(_tensor(params[grid]), _place(volume, boundary, places), bricks=bricks)
+        lattice = Lattice(_tensor(params[grid]), grids.place(volume, boundary), bricks=bricks)
         if bricks is not None:
             lattice = lattice.where_derivatives()
-        return GridExtinction(name, lattice, volume if volume.class_name() == "GridVolume" else None)
-    if constant not in params.properties:
-        keys = sorted(k for k in params.properties if k.startswith(name + "."))
-        raise MivolError(
-            f"{name} of a {kind} has the parameters {keys}; a number, an rgb triple, a constvolume, a gridvolume or "
-            "mivol_voxels is expected."
-        )
+        if is_stock and not grids.is_trilinear(volume, lattice):
+            return _field_part(name, PluginField(volume), scale)
+        return GridExtinction(name, lattice)
     value = params[constant]
     if kind != "HeterogeneousMedium":  # a stock heterogeneous fills the box of its constvolume only
         return ConstantExtinction(name, value)
     channels = [value[c] for c in range(dr.size_v(value))] if dr.size_v(value) == 3 else [mi.Float(value)]
     values = mi.TensorXf(dr.ravel(mi.Color3f(*channels)) if len(channels) == 3 else channels[0], (1, 1, 1, len(channels)))
-    if volume.ptr not in places:
-        places[volume.ptr] = find_grid_place(volume)
-    return GridExtinction(name, Lattice(values, places[volume.ptr]))
+    return GridExtinction(name, Lattice(values, grids.place(volume, None)))
 
 
 def _tensor(values: mi.TensorXf) -> mi.TensorXf:
     """Grid values as (Z, Y, X, C), or (bricks, 8, 8, 8, C)."""
     return values if len(values.shape) >= 4 else mi.TensorXf(values.array, (*values.shape, 1))
-
-
-def find_grid_place(volume: mi.Volume, boundary: Box | None = None) -> np.ndarray:
-    """Find the place of a grid volume: the (4, 4) float64 map of the unit cube to the world.
-
-    A ``mivol_voxels`` has its own map. A stock ``gridvolume`` only prints its transform, to 6 digits, and returns its bounding
-    box, in float32. Together they are exact for boxes along the axes. A rotated grid is exact if it fills its boundary, and
-    otherwise right to 5e-6 of its size.
-    """
-    if hasattr(volume, "mivol_to_world"):
-        return volume.mivol_to_world
-    text = str(volume)
-    rows = re.search(r"inverse_transpose=\[\[(.*?)\]\]", text, re.S).group(1)
-    place = np.array([[float(v) for v in row.split(",")] for row in re.split(r"\],\s*\[", rows)]).T
-    box = volume.bbox()
-    low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
-    place[:3, :3] *= ((high - low) / np.abs(place[:3, :3]).sum(axis=1))[:, None]
-    place[:3, 3] = (low + high - place[:3, :3].sum(axis=1)) / 2
-    place[3] = (0, 0, 0, 1)
-    if boundary is not None and boundary.matches(place, 1e-5):
-        return _same_axes(boundary.to_world, place)
-    return place
-
-
-def _same_axes(exact: np.ndarray, rough: np.ndarray) -> np.ndarray:
-    """The exact box, with its axes in the order and the direction of the axes of the rough box."""
-    edges = exact[:3, :3]
-    permutation = np.linalg.solve(edges, rough[:3, :3])  # of the axes, with signs, to the digits of ``rough``
-    axes = edges @ np.round(permutation)
-    centre = exact[:3, 3] + edges.sum(axis=1) / 2
-    place = np.eye(4)
-    place[:3, :3], place[:3, 3] = axes, centre - axes.sum(axis=1) / 2
-    return place

@@ -1,0 +1,64 @@
+r"""A volume of Mitsuba, or of another package, as an extinction: values at points by its own ``eval``, and its own ``max``.
+
+.. math:: \sigma_t(x) = s\, v(x), \qquad 0 \le v(x) \le \max v
+
+Conventions. The place is the bounding box of the volume, as in Mitsuba's ``heterogeneous``; outside of it the extinction is 0.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.fields.protocol import BOUNDED, accumulate_tracked
+from mivol.scene_graph import list_values, traverse
+
+__all__ = ["PluginField"]
+
+
+class PluginField:
+    """A bounded extinction (:class:`mivol.fields.protocol.Field`) that calls a volume plugin at points.
+
+    The plugin promises that no value lies below 0 or above ``max()``, as Mitsuba's own integrators assume.
+
+    Args:
+        volume: a plugin with ``max()`` and ``eval``. Its values are grey if ``channel_count()`` is 1, else rgb.
+
+    Attributes:
+        kind: class of the volume.
+
+    Raises:
+        MivolError: a volume without a finite bounding box.
+    """
+
+    line: ClassVar[str] = BOUNDED
+
+    def __init__(self, volume: mi.Volume) -> None:
+        self.volume, self.kind = volume, type(volume).__name__
+        box = mi.Volume.bbox(volume)  # what Mitsuba reads too: it ignores a bbox() of Python
+        low, high = np.array(box.min, np.float64).ravel(), np.array(box.max, np.float64).ravel()
+        if not (np.isfinite(high - low).all() and (high > low).all()):
+            found = f"the volume {self.kind} has the bounding box {low} to {high}"
+            raise MivolError(f"{found}; a finite box is expected: give to_world.")
+        self.to_world = np.eye(4)
+        self.to_world[:3] = np.c_[np.diag(high - low), low]
+        self.channels = 1 if mi.is_monochromatic or volume.channel_count() == 1 else 3
+
+    def eval(self, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> list[mi.Float]:
+        it = dr.zeros(mi.Interaction3f, dr.width(p))
+        it.p = p
+        values = self.volume.eval(it, active)
+        return [dr.select(active, values[channel], 0) for channel in range(self.channels)]
+
+    def accumulate(self, p: mi.Point3f, w: mi.Vector3f, d: list[mi.Float], active: mi.Bool) -> None:
+        accumulate_tracked(self, p, w, d, active)
+
+    def bound(self) -> list[float]:
+        return [float(self.volume.max())] * self.channels
+
+    def parameters(self) -> dict[str, Any]:
+        return dict(list_values(traverse(self.volume)))
