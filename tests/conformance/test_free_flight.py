@@ -161,6 +161,24 @@ def test_each_channel_is_its_grey_render(ratio):
         assert_precise(difference(*both), 0.02 * grey.mean[channel], what=f"channel {channel}")
 
 
+@pytest.mark.statistical
+def test_a_coloured_fog_in_a_grey_smoke_is_its_grey_renders():
+    """Absorption of a colour beside a grid that scatters alike in all channels: camera rays fly in each of the channels."""
+    parts, emitters = {"sigma_s": grid_volume("mivol_voxels", rough_grid(6, 2.0), PLACE)}, {"sky": scenes.sky(0.5)}
+
+    def radiance(absorption: object) -> Moments:
+        smoke = box_of({"type": "mivol_medium", "sigma_a": absorption, **parts}, PLACE)
+        return over_pixels(small.moments(close_up({"smoke": smoke, **emitters}, res=8), mivol(max_depth=6), 64))
+
+    colours = (0.2, 0.8, 2.0)
+    colour = radiance({"type": "rgb", "value": list(colours)})
+    for channel, absorption in enumerate(colours):
+        grey = radiance(absorption)
+        both = [type(e)(*(np.asarray(v)[channel, None] for v in e)) for e in (colour, grey)]
+        assert_same_mean(*both, rounding=1e-5, what=f"channel {channel}")
+        assert_precise(difference(*both), 0.02 * grey.mean[channel], what=f"channel {channel}")
+
+
 # -- Scenes, against Mitsuba ---------------------------------------------------------------------------------------------------
 
 

@@ -268,7 +268,8 @@ class FreeFlight:
         Bias: as of :func:`regular_tracking`. Cost: one walk up to the collision.
         """
         parts = [part for body in self.bodies for part in body.view.parts]
-        if not any(part.exact_line and _uses_delta_tracking(part) for part in parts):
+        # With an rgb extinction the throughput of the path draws the channel of the flight, and is not known yet.
+        if self.media.channels > 1 or not any(part.exact_line and _uses_delta_tracking(part) for part in parts):
             return None
         u, rng = self.draw(sampler, active)
         _, flight = _find_first_collision(self.media, ray, medium, u, mi.UInt32(0), rng, active, inverts=True)
