@@ -182,6 +182,9 @@ class Readings(Section):
     saturation: Annotated[float, setting("reading", "smallest saturated reading, not used", gt=0)] = INFINITY
 
 
+FirstRow = Annotated[Literal["lowest", "highest"], setting("1", "row of the detector that the file has first")]
+
+
 class Measured(Readings, kw_only=True, tag_field="source", tag="measured"):
     """An HDF5 file with flat and dark fields: NXtomo (NeXus), Data Exchange, or datasets by name."""
 
@@ -199,8 +202,9 @@ class Measured(Readings, kw_only=True, tag_field="source", tag="measured"):
     ] = None
     rows: Annotated[
         tuple[Annotated[int, msgspec.Meta(ge=0)], Count] | None,
-        setting("pixel", "first row, and row after the last, of a parallel beam; absent: all"),
+        setting("pixel", "first row, and row after the last, as in the file, of a parallel beam; absent: all"),
     ] = None
+    first_row: FirstRow = "lowest"
 
 
 class Stack(Readings, kw_only=True, tag_field="source", tag="stack"):
@@ -228,7 +232,7 @@ class Stack(Readings, kw_only=True, tag_field="source", tag="stack"):
     light: Annotated[float, setting("reading", "of a pixel without object, in place of flats; 0: flats, or none", ge=0)] = 0.0
     angles: Annotated[str, setting("path", "text with one angle per view, or DICOM views; empty: evenly over scan.arc")] = ""
     angle_unit: Annotated[Literal["degree", "radian"], setting("1", "unit of the angles in the file")] = "degree"
-    first_row: Annotated[Literal["lowest", "highest"], setting("1", "row of the detector that the file has first")] = "lowest"
+    first_row: FirstRow = "lowest"
 
     def __post_init__(self) -> None:
         has_light = bool(self.flats) != bool(self.light)

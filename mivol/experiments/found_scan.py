@@ -37,7 +37,7 @@ FLAT_WORDS = {
     *("flat", "flats", "flatfield", "ff", "white", "whites", "bright", "open", "openbeam", "ob", "empty", "gain", "air"),
     *("ref", "refs", "reference", "io", "i0"),
 }
-DARK_WORDS = {"dark", "darks", "darkfield", "df", "dc", "di", "offset", "bias", "background"}
+DARK_WORDS = {"dark", "darks", "darkfield", "df", "dc", "di", "offset", "bias", "background", "darkend"}
 """Words in the names of files and folders of light without a sample, and of no light."""
 
 ANGLE_FILES = (".txt", ".csv", ".ang", ".tlt", ".rawtlt")
@@ -50,6 +50,8 @@ DARKER = 0.9
 
 VOXEL_BYTES = 8 * 4 * 10
 """Memory per voxel of the default solver [byte]: eight unknowns, and about ten numbers each."""
+
+FIRST_ROW = "assumed: the first row of an image is the highest; data.first_row sets it"
 
 HELD_OUT, FEW_VIEWS = 20, 60
 """Every twentieth view is predicted and not fitted, in scans of at least sixty views."""
@@ -158,9 +160,10 @@ def _draft_hdf5(path: Path, given: dict[str, Any]) -> ScanDraft:
     else:
         first, last = np.degrees(scan.angles[[0, -1]])
         lines.append(f"found: angles from {first:.4g} to {last:.4g} degrees")
+    lines.append(FIRST_ROW)
     lines += _draft_beam(raw_scan, scan.pitch, scan.distances, (height, columns))
     raw: dict[str, Any] = {"unit": "mm"} if scan.pitch else {}
-    raw |= {"scan": raw_scan, "data": {"source": "measured", "file": str(path)}}
+    raw |= {"scan": raw_scan, "data": {"source": "measured", "file": str(path), "first_row": "highest"}}
     return _finish(raw, [*lines, *_put_grid(raw, rows, columns)], views)
 
 
@@ -180,7 +183,8 @@ def _draft_beam(
             "assumed: a parallel beam, since the files have no distances; scan.beam sets it",
             "assumed: pixels of edge 1, since the files have no size of a pixel; scan.pitch sets it",
         ]
-    scan["pitch"] = pitch[1] if pitch[0] == pitch[1] else list(pitch)
+    edges = [float(f"{edge:.8g}") for edge in pitch]
+    scan["pitch"] = edges[1] if edges[0] == edges[1] else edges
     lines = [f"found: pixels of {pitch[0]:.6g} x {pitch[1]:.6g} mm (rows, columns)"]
     source, detector = distances
     if source is None:
@@ -424,7 +428,7 @@ def _draft_tiff(path: Path, given: dict[str, Any]) -> ScanDraft:
         reading, why = guess_reading(path, images["views"][0])
         data |= reading
         lines.append(f"assumed: no flats, and {why}: the pixels are taken as {data['reading']}s; data.reading sets it")
-    lines.append("assumed: the first row of an image is the highest; data.first_row sets it")
+    lines.append(FIRST_ROW)
     data["first_row"] = "highest"
     scan: dict[str, Any] = {"beam": "parallel"}
     three = _three_views(

@@ -91,14 +91,25 @@ def read_hdf5_scan(settings: config.ScanExperiment, base: Path, rows: slice) -> 
     data: Measured = settings.data
     names = {role: getattr(data, role) for role in ("data", "flats", "darks", "angles")}
     path = resolve_path(base, data.file)
-    scan = read_projections(path, data.group, names, data.angle_unit, _rows_of_file(data.rows, rows))
-    fields = scan.projections, scan.flats, scan.darks
+    part, order = _rows_in_file(settings, base, rows)
+    scan = read_projections(path, data.group, names, data.angle_unit, _rows_of_file(data.rows, part))
+    fields = scan.projections[:, order], scan.flats[:, order], scan.darks[:, order]
     angles = scan.angles
     if angles is None and not isinstance(settings.scan, Table | Matrices):
         angles = even_angles(settings.scan, len(scan.projections))
     elif angles is not None:
         check_unit(np.degrees(angles), "degree", 'set data.angle_unit = "radian"')
     return ScanReadings(correct_transmission(*fields, data.saturation), angles, intensity=fields, notes=scan.notes)
+
+
+def _rows_in_file(settings: config.ScanExperiment, base: Path, rows: slice) -> tuple[slice, slice]:
+    """Rows of the detector as the file counts them, for ``rows`` counted upwards; and a slice that puts them upwards again."""
+    if settings.data.first_row == "lowest":
+        return rows, ALL
+    if rows == ALL:
+        return ALL, slice(None, None, -1)
+    down = range(detector_size(settings, base)[1])[::-1][rows]
+    return slice(down[-1], down[0] + 1, -down.step), slice(None, None, -1)
 
 
 def _rows_of_file(chosen: tuple[int, int] | None, rows: slice) -> slice | None:
@@ -116,19 +127,14 @@ def read_stack_scan(settings: config.ScanExperiment, base: Path, rows: slice) ->
         MivolError: as :func:`read_scan`.
     """
     data: Stack = settings.data
-
-    is_flipped = data.first_row == "highest"
-    if is_flipped and rows != ALL:
-        # The same rows counted downwards: ``rows`` of the flipped rows.
-        last = range(detector_size(settings, base)[1])[::-1][rows]
-        rows = slice(last[-1], last[0] + 1, -last.step)
+    rows, order = _rows_in_file(settings, base, rows)
 
     def stack(name: str) -> np.ndarray:
         if data.images == "sinograms":
             values = read_stack(base / name, data.dataset or None)[rows].swapaxes(0, 1)
         else:
             values = read_stack(base / name, data.dataset or None, rows)
-        return values[:, ::-1] if is_flipped else values
+        return values[:, order]
 
     readings = stack(data.file)
     fields, notes = None, ()
@@ -313,7 +319,7 @@ def note_rows(data: config.Readings, geometry: FlatDetector, grid: VoxelGrid, y:
     if not order.excess > LIMIT:
         return []
     way_out = "turn the sign of the geometry's steps along v"
-    if isinstance(data, Stack):
+    if isinstance(data, Stack | Measured):
         way_out = f'set data.first_row = "{"lowest" if data.first_row == "highest" else "highest"}"'
     if isinstance(geometry, ConeBeam) and geometry.detector_offset[0]:
         way_out += ", or turn the sign of scan.detector_offset along v"

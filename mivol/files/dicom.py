@@ -188,10 +188,19 @@ def guarded(file: Path) -> Iterator[None]:
 def _read_header(dcmread: Any, file: Path) -> Any:
     with guarded(file):
         header = dcmread(file, stop_before_pixels=True, specific_tags=list(KEYWORDS))
-        # pydicom converts an element when it is asked for it first.
-        for keyword in KEYWORDS:
+    check_elements(file, header, KEYWORDS)
+    return header
+
+
+def check_elements(file: Path, header: Any, keywords: tuple[str, ...]) -> None:
+    """Convert elements of a header, which pydicom does when an element is asked for first.
+
+    Raises:
+        MivolError: a damaged element.
+    """
+    with guarded(file):
+        for keyword in keywords:
             header.get(keyword)
-        return header
 
 
 def frame_count(header: Any, file: Path) -> int:

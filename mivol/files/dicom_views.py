@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.files.dicom import decode, find_dicom, frame_count, guarded, import_dcmread, is_dicom_file
+from mivol.files.dicom import check_elements, decode, find_dicom, frame_count, guarded, import_dcmread, is_dicom_file
 from mivol.files.npy import check_memory
 from mivol.files.source import refusal
 
@@ -117,6 +117,8 @@ def survey_views(path: str | os.PathLike) -> DicomViews:
     headers = _views_of(path)
     if not headers:
         raise refusal(path, "no DICOM views from several angles", "X-ray angiography or RT images", "name another file")
+    for file, header in headers.items():
+        check_elements(file, header, KEYWORDS)
     series = {str(header.get("SeriesInstanceUID", "")) for header in headers.values()}
     if len(series) > 1:
         raise refusal(path, f"views of {len(series)} series", "one", "put one series into a folder of its own")
@@ -124,7 +126,9 @@ def survey_views(path: str | os.PathLike) -> DicomViews:
     frames, angles, assumed = [], [], []
     facts: list[tuple[float, ...]] = []
     first = ordered[0][1]
-    is_rt = _finder(first, 0)("GantryAngle") is not None
+    with guarded(ordered[0][0]):
+        is_rt = _finder(first, 0)("GantryAngle") is not None
+        is_falling = _number(ordered[0][0], _finder(first, 0), "PixelIntensityRelationshipSign") == -1
     for file, header in ordered:
         with guarded(file):
             count = frame_count(header, file)
@@ -150,7 +154,7 @@ def survey_views(path: str | os.PathLike) -> DicomViews:
     return DicomViews(
         path, tuple(frames), "RT image" if is_rt else "X-ray angiography", np.array(angles), to_axis, to_detector,
         (pitch_v, pitch_u), (offset_v, offset_u), (rows, columns), str(first.get("PixelIntensityRelationship") or ""),
-        _number(path, _finder(first, 0), "PixelIntensityRelationshipSign") == -1, tuple(dict.fromkeys(assumed)),
+        is_falling, tuple(dict.fromkeys(assumed)),
     )  # fmt: skip
 
 

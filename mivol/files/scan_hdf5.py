@@ -466,8 +466,10 @@ def _check_projections(path: Path, stacks: dict[str, np.ndarray], names: dict[st
             )
     if angles is not None and len(angles) != len(projections):
         raise refusal(path, f"{len(angles)} angles", f"{len(projections)}, one per view", "correct theta")
-    for name, numbers in (("theta", angles), *((names.get(role, role), stack) for role, stack in stacks.items())):
+    for role, numbers in (("theta", angles), *stacks.items()):
         bad = ~np.isfinite(numbers) if numbers is not None else np.empty(0)
         if bad.any():
             index = tuple(int(i) for i in np.argwhere(bad)[0])
-            raise refusal(path, f"{numbers[index]} in {name} at {index}", "finite numbers", "repair the file")
+            found = f"{numbers[index]} in {names.get(role, role)} at {index}, counted from 0 among the {role}"
+            way_out = "repair the angles" if role == "theta" else "replace it by 0: a reading of 0 has weight 0"
+            raise refusal(path, found, "finite numbers", way_out)

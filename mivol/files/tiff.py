@@ -225,8 +225,9 @@ class ImageGroup(NamedTuple):
 
     @property
     def words(self) -> set[str]:
-        """Words of the name, in lower case; "i0" is one."""
-        return set(re.findall(r"i0|[a-z]+", self.name.lower().rpartition(".")[0].replace("#", "0")))
+        """Words of the name, in lower case: "refHST" has two, and "i0" is one."""
+        name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", self.name.rpartition(".")[0]).lower()
+        return set(re.findall(r"i0|[a-z]+", name.replace("#", "0")))
 
     @property
     def size(self) -> int:

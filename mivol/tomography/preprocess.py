@@ -110,7 +110,7 @@ def calibrate(readings: np.ndarray, flats: np.ndarray, darks: np.ndarray, satura
         notes = (f"the noise is unknown, because {found} no scatter; photon noise is assumed, and the fit finds its size",)
     else:
         gain = max(float(flats.var(0, ddof=1)[alive].mean()) - dark_variance, 0.0) / float(light[alive].mean())
-        if len(darks) == 1:
+        if len(darks) == 1 and darks.any():
             notes = ("one dark: its noise is unknown, and the scatter of the flats counts as noise of quanta",)
     full = float(flats.max())
     share = float(np.mean(flats == full))

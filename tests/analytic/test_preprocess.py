@@ -100,6 +100,7 @@ def test_one_dark_leaves_its_noise_to_the_quanta() -> None:
     assert (found.dark_variance, found.gain, found.n_darks) == (0, pytest.approx(200 / (371 / 4)), 1)
     assert found.notes == ("one dark: its noise is unknown, and the scatter of the flats counts as noise of quanta",)
     assert preprocess.correct_transmission(READINGS, FLATS, DARKS[1:2]).notes == found.notes
+    assert preprocess.calibrate(READINGS, FLATS, np.zeros_like(DARKS[:1])).notes == ()
 
 
 def test_quanta_of_a_pixel() -> None:

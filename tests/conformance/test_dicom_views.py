@@ -99,6 +99,14 @@ def test_a_header_that_lacks_a_fact_is_refused(tmp_path: Path, more: dict[str, o
         draft_scan(path)
 
 
+def test_a_damaged_element_is_refused(tmp_path: Path) -> None:
+    """pydicom reads the kind of a value when it is asked for it: ``Cs`` is none."""
+    path = write_angiography(tmp_path / "a.dcm", ANGLES)
+    path.write_bytes(path.read_bytes().replace(b"\x28\x00\x40\x10CS", b"\x28\x00\x40\x10Cs"))
+    with pytest.raises(MivolError, match="damaged DICOM file.*'Cs'"):
+        read_stack(path)
+
+
 def test_falling_logarithms_are_line_integrals(tmp_path: Path) -> None:
     signs = {"PixelIntensityRelationship": "LOG", "PixelIntensityRelationshipSign": -1}
     draft = draft_scan(write_angiography(tmp_path / "a.dcm", ANGLES, **signs))

@@ -125,6 +125,7 @@ BROKEN = {
     "truncated": lambda path: path.write_bytes(path.read_bytes()[:2500]),
     "truncated target": lambda path: (p := path.with_name("a_frames.h5")).write_bytes(p.read_bytes()[:700]),
     "nothing": lambda path: change(path, "entry", None),
+    "nan": lambda path: change(path, "entry/instrument/detector/data", np.where(FRAMES[5, 1, 2] == FRAMES, np.nan, FRAMES)),
 }
 SENTENCES = {
     "target": r"a link from entry/instrument/detector/data to a_frames.h5:entry/data/data, which cannot be read, expected its",
@@ -135,6 +136,7 @@ SENTENCES = {
     "angles": "7 angles in entry/sample/rotation_angle, expected 10, one for each frame, or 5, one for each view",
     "truncated": "a damaged or foreign file .*truncated",
     "truncated target": "a link from entry/instrument/detector/data to a_frames.h5",
+    "nan": r"nan in entry/instrument/detector/data at \(2, 1, 2\), counted from 0 among the data, .* replace it by 0",
     "nothing": r"neither an image_key \(NXtomo\) nor a group exchange .* name the datasets: data.data",
 }
 

@@ -45,7 +45,7 @@ def test_settings_of_a_nexus_file(tmp_path: Path) -> None:
     path = write_nxtomo(write_nxtomo(tmp_path / "a.nxs"), "entry2")
     draft = draft_scan(path)
     assert draft.raw["scan"] == {"beam": "parallel", "pitch": [0.004, 0.002]}
-    assert draft.raw["data"] == {"source": "measured", "file": str(path)} and draft.raw["unit"] == "mm"
+    assert draft.raw["data"] == {"source": "measured", "file": str(path), "first_row": "highest"} and draft.raw["unit"] == "mm"
     assert "grid" not in draft.raw
     assert draft.lines[:2] == (
         "found: NXtomo, entry entry: 5 views of 2 x 3 pixels, 2 flats, 2 darks",
@@ -102,6 +102,17 @@ def test_a_folder_of_images(tmp_path: Path) -> None:
             file.rename(tmp_path / "two" / name / file.name.replace(file.name[:4], "img_"))
     data = draft_scan(tmp_path / "two").raw["data"]
     assert {Path(data[role]).parent.name for role in ("file", "flats", "darks")} == {"proj", "Flats", "dark_field"}
+
+
+@pytest.mark.parametrize(("flats", "darks"), [("refHST_", "darkend"), ("OpenBeam", "camOffset"), ("I0", "DI_")])
+def test_words_in_names_begin_with_a_capital(tmp_path: Path, flats: str, darks: str) -> None:
+    """``refHST0000_0000.edf`` and ``darkend0000.edf`` are the names of flats and darks at the ESRF."""
+    folder = write_tiffs(tmp_path / "scan")
+    for file in folder.glob("[fd]*"):
+        word = {"flat_": flats, "dark_": darks}[file.name[:5]]
+        file.rename(folder / (word + file.name[5:]))
+    data = draft_scan(folder).raw["data"]
+    assert flats in data["flats"].replace("*", "0") and darks in data["darks"]
 
 
 def test_names_that_no_pattern_tells_apart(tmp_path: Path) -> None:

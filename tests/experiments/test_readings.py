@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import h5py
 import numpy as np
 import pytest
 
 from mivol import config
-from mivol.config import Measured, Stack
+from mivol.config import Measured, Nikon, Stack
 from mivol.experiments import projections, readings
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import PanelViews
@@ -42,7 +44,8 @@ TOLD = {
         'set data.first_row = "highest", or turn the sign of scan.detector_offset along v',
     ),
     "a helix": (table(1.0), Stack(file="y.npy", reading="line_integral", first_row="highest"), '= "lowest"'),
-    "another file": (table(1.0), Measured(file="y.h5"), "turn the sign of the geometry's steps along v"),
+    "an HDF5 file": (table(1.0), Measured(file="y.h5"), 'set data.first_row = "highest"'),
+    "another file": (table(1.0), Nikon(file="y.xtekct"), "turn the sign of the geometry's steps along v"),
 }
 
 
@@ -56,6 +59,23 @@ def test_rows_that_are_upside_down_are_said(variant_rgb, case: str) -> None:
     (said,) = readings.note_rows(wanted, geometry, GRID, y[:, ::-1], weights)
     assert said.startswith("the detector's rows seem to be upside down: a small reconstruction misses ")
     assert said.endswith(way_out)
+
+
+@pytest.mark.parametrize("chosen", ["", "rows = [1, 7], "])
+@pytest.mark.parametrize("part", [readings.ALL, slice(1, 5, 2), slice(2, 3)])
+def test_rows_of_an_hdf5_file_are_counted_upwards(tmp_path: Path, part: slice, chosen: str) -> None:
+    """With the highest row first in the file, views, flats and darks are turned, and rows are read alone."""
+    frames = np.random.default_rng(1).integers(10, 1000, (9, 8, 5))
+    names = {"data": frames[:5], "flats": 2000 + frames[5:7], "darks": frames[7:] // 10}
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.update(names)
+    data = ", ".join(f'{role} = "{role}"' for role in names)
+    text = f'title = "t"\nscan = {{ beam = "parallel" }}\ndata = {{ source = "measured", file = "a.h5", {data}, {chosen}'
+    settings = config.from_dict(tomllib.loads(text + 'first_row = "highest" }'))
+    found = readings.read_scan(settings, tmp_path, part).intensity
+    for role, rows in zip(names, found, strict=True):
+        whole = names[role][:, 1:7] if chosen else names[role]
+        np.testing.assert_array_equal(rows, whole[:, ::-1][:, part])
 
 
 def test_a_circle_of_views_cannot_tell(variant_rgb) -> None:
