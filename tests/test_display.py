@@ -20,7 +20,7 @@ import mivol
 from mivol.display import curve_html, summarize, with_short_repr
 from mivol.experiments.script import Problem, optimize
 from mivol.files import VolumeData
-from mivol.files.notebook import EDGE, GAP, pairs_html
+from mivol.files.image_files import EDGE, GAP, pairs_html
 
 SHORT = 400
 """Letters of a line that a person reads."""

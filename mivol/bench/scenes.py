@@ -7,7 +7,8 @@ medium.
 
 Rays are in world space. Times of long fits are given for a machine that walks ``REFERENCE_RATE`` rays per second through the
 smoke of the tutorial. The rate of this machine is measured in the same run, so other work on the machine changes both times
-alike."""
+alike.
+"""
 
 from __future__ import annotations
 

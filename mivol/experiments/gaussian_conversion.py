@@ -21,8 +21,7 @@ from mivol.files.source import check_file, refusal, select_by_suffix
 from mivol.optim.photographs.field_view import render_view
 from mivol.photos import Camera, aim_camera, intrinsics, pixel_centres, project, rays
 from mivol.photos.camera_path import HomeView
-from mivol.points.cloud import read_points
-from mivol.points.conversions import points_to_gaussians
+from mivol.points.cloud import points_to_gaussians, read_points
 from mivol.points.gaussian_files import is_gaussian_file, read_gaussian_view, read_gaussians, write_gaussians
 from mivol.points.gaussians import Gaussians
 from mivol.points.summary import crop_cloud

@@ -31,12 +31,11 @@ from mivol.optim.photographs.field_view import render_view
 from mivol.optim.scenes.views import derive_seed
 from mivol.photos import Camera, aim_camera, intrinsics
 from mivol.photos.camera_path import HomeView
-from mivol.points.cloud import PointCloud, read_points
-from mivol.points.conversions import points_to_gaussians
+from mivol.points.cloud import PointCloud, points_to_gaussians, read_points
 from mivol.points.gaussian_files import is_gaussian_file, read_gaussian_view, read_gaussians
 from mivol.points.gaussians import Gaussians
-from mivol.scene.description import describe_error
 from mivol.scene.explain import describe_light
+from mivol.scene.load import describe_error
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.splatting import Splatter, to_tensors
 

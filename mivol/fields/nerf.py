@@ -203,7 +203,7 @@ class NerfField(SampledField):
         Args:
             arrays: ``pts_linears.0.weight`` (outputs, inputs), ``pts_linears.0.bias`` (outputs,), ..., ``alpha_linear``,
                 ``feature_linear``, ``views_linears.0`` and ``rgb_linear``, as ``np.load`` reads them from an ``.npz`` and
-                :func:`mivol.files.safetensors.read_safetensors` from a safetensors file. A NeRF-SH has ``sh_linear``
+                :func:`mivol.files.npy.read_safetensors` from a safetensors file. A NeRF-SH has ``sh_linear``
                 (3 basis, inputs), channel by channel, in place of the last three.
             to_world: (4, 4), unit cube to world: the box outside of which the field is 0.
             frame: origin (x, y, z) and unit of the places that the network was trained with [length].

@@ -41,6 +41,7 @@ import numpy as np
 from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.fields.activation import Activation, select_activation
+from mivol.fields.bricks import SparseIndex
 from mivol.fields.harmonics import (
     SPACES,
     basis_size,
@@ -50,8 +51,7 @@ from mivol.fields.harmonics import (
     rotate_direction,
     row_width,
 )
-from mivol.fields.sparse_index import SparseIndex
-from mivol.files.notebook import slices_html
+from mivol.files.image_files import slices_html
 from mivol.kernel_recording import copy_aligned
 from mivol.space import check_affine, lattice_from_world
 

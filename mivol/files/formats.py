@@ -29,14 +29,12 @@ from mivol.files import (
     npy,
     nrrd,
     nvdb,
-    nvdb_writer,
     raw,
     renderer_grids,
     tiff,
     vdb,
     vdb_writer,
-    vti,
-    vtk_legacy,
+    vtk,
     zarr,
 )
 from mivol.files.atomic import write_whole
@@ -92,8 +90,8 @@ FORMATS: dict[str, VolumeFormat] = {
     ".mha": _METAIMAGE,
     ".nii": VolumeFormat("NIfTI", nifti.is_nifti, nifti.read_nifti),
     ".nii.gz": VolumeFormat("gzip-compressed NIfTI", nifti.is_nifti_gz, nifti.read_nifti),
-    ".vti": VolumeFormat("VTK XML image", lambda head: b"<VTKFile" in head, vti.read_vti),
-    ".vtk": VolumeFormat("legacy VTK", _starts_with(vtk_legacy.MAGIC), vtk_legacy.read_vtk),
+    ".vti": VolumeFormat("VTK XML image", lambda head: b"<VTKFile" in head, vtk.read_vti),
+    ".vtk": VolumeFormat("legacy VTK", _starts_with(vtk.MAGIC), vtk.read_vtk),
     ".vdb": VolumeFormat("OpenVDB", vdb.is_vdb, vdb.read_vdb),
     ".nvdb": VolumeFormat("NanoVDB", nvdb.is_nvdb, nvdb.read_nvdb),
     ".pbrt": VolumeFormat("pbrt volumegrid", renderer_grids.is_pbrt, renderer_grids.read_pbrt),
@@ -154,11 +152,11 @@ WRITERS: dict[str, Callable[[BinaryIO, np.ndarray, np.ndarray, dict[str, Any]], 
     ".npz": npy.write_npz,
     ".nrrd": nrrd.write_nrrd,
     ".vdb": vdb_writer.write_vdb,
-    ".nvdb": nvdb_writer.write_nvdb,
+    ".nvdb": vdb_writer.write_nvdb,
     ".mhd": metaimage.write_metaimage,
     ".mha": metaimage.write_metaimage,
     ".nii": nifti.write_nifti,
-    ".vti": vti.write_vti,
+    ".vti": vtk.write_vti,
     ".mrc": mrc.write_mrc,
     ".tif": tiff.write_tiff,
     ".tiff": tiff.write_tiff,
@@ -301,7 +299,7 @@ def write_volume(
     write_whole(path, lambda file: writer(file, values, to_world, dict(metadata or {})))
 
 
-GRID_WRITERS = {".vdb": vdb_writer.write_vdb_grids, ".nvdb": nvdb_writer.write_nvdb_grids}
+GRID_WRITERS = {".vdb": vdb_writer.write_vdb_grids, ".nvdb": vdb_writer.write_nvdb_grids}
 """suffix -> writer of several grids in one file."""
 
 

@@ -1,4 +1,4 @@
-"""NumPy's files: ``.npy`` (one array without placement) and ``.npz`` (arrays by name, placement and metadata).
+"""Arrays in files: NumPy's ``.npy`` (one array) and ``.npz`` (arrays by name, with placement), and ``.safetensors``.
 
 Own checks before NumPy's reader, which allocates whatever an archive claims.
 
@@ -6,6 +6,10 @@ Conventions. Grids are (Z, Y, X) or (Z, Y, X, C). A ``.npz`` of mivol holds ``va
 and ``metadata`` (a 0-d string of JSON). Any other ``.npz`` is read by the name of an array and placed on the unit cube. Only
 numbers, truth values and text are read, never Python objects. :func:`read_archive` compares the
 size of each array in its header with the size of the member, and the sum of the sizes with the free memory.
+
+A file of safetensors holds weights of networks, without pickled code: the length of its header (8 bytes, little endian), the
+header (JSON: name -> dtype, shape, first and last byte), and the numbers. Own reader: the package safetensors 0.8 cannot read
+BF16 into NumPy. Reference: https://github.com/huggingface/safetensors.
 """
 
 from __future__ import annotations
@@ -16,6 +20,7 @@ import struct
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -23,9 +28,29 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.files.source import refusal, refuse_dataset, select_dataset
+from mivol.files.atomic import write_whole
+from mivol.files.source import check_file, refusal, refuse_dataset, select_dataset
 from mivol.files.volume import VolumeData, to_values
 from mivol.machine import available_memory
+
+__all__ = [
+    "DAMAGE",
+    "KINDS",
+    "NPY_MAGIC",
+    "NPZ_MAGIC",
+    "NUMBER_TYPES",
+    "check_arrays",
+    "check_memory",
+    "count_axes",
+    "read_archive",
+    "read_npy",
+    "read_npz",
+    "read_safetensors",
+    "write_npy",
+    "write_npz",
+    "write_npz_stored",
+    "write_safetensors",
+]
 
 NPY_MAGIC = b"\x93NUMPY"
 NPZ_MAGIC = b"PK\x03\x04"
@@ -217,3 +242,59 @@ def _read_array_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype,
         raise ValueError(f"version {version} of an array header")
     shape, order, dtype = readers[version](file, max_header_size=10000)
     return shape, order, dtype, file.tell()
+
+
+# -- Safetensors -------------------------------------------------------------------------------------------------------
+
+TYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "U8": "|u1"}
+"""NumPy types of the format's words; BF16 is the upper half of a float32."""
+
+LARGEST_HEADER = 100_000_000
+"""Bytes; the format's own limit."""
+
+
+def read_safetensors(path: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of a file; BF16 as float32.
+
+    Raises:
+        MivolError: no such file, a header that is none, or arrays that lie outside of the file or have an unknown type.
+    """
+    data = check_file(path).read_bytes()
+    length = int.from_bytes(data[:8], "little") if len(data) >= 8 else LARGEST_HEADER
+    try:
+        if length > min(LARGEST_HEADER, len(data) - 8):
+            raise ValueError
+        header = json.loads(data[8 : 8 + length])
+        header.pop("__metadata__", None)
+        entries = {name: (v["dtype"], tuple(map(int, v["shape"])), *v["data_offsets"]) for name, v in header.items()}
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise MivolError(f"{path} has no header of safetensors: export the weights again, or give an .npz.") from None
+    return {name: _read_array(path, name, entry, data[8 + length :]) for name, entry in entries.items()}
+
+
+def _read_array(path: Path, name: str, entry: tuple, numbers: bytes) -> np.ndarray:
+    kind, shape, first, last = entry
+    if kind not in (*TYPES, "BF16"):
+        raise MivolError(f"{path} has {name} of the type {kind}; {', '.join(TYPES)} or BF16 is expected: export it as F32.")
+    size = 2 if kind == "BF16" else np.dtype(TYPES[kind]).itemsize
+    if not (0 <= first <= last <= len(numbers) and last - first == size * math.prod(shape)):
+        raise MivolError(
+            f"{path} has {name} in bytes {first} to {last} of {len(numbers)}, against its shape {shape}: export it again."
+        )
+    if kind == "BF16":
+        upper = np.frombuffer(numbers[first:last], "<u2").astype(np.uint32) << 16
+        return upper.view(np.float32).reshape(shape)
+    return np.frombuffer(numbers[first:last], TYPES[kind]).reshape(shape)
+
+
+def write_safetensors(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write float32 arrays by name."""
+    header, parts, first = {}, [], 0
+    for name, array in arrays.items():
+        part = np.ascontiguousarray(array, "<f4").tobytes()
+        header[name] = {"dtype": "F32", "shape": list(np.shape(array)), "data_offsets": [first, first + len(part)]}
+        parts.append(part)
+        first += len(part)
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)  # the numbers begin at a multiple of 8 bytes
+    write_whole(path, lambda file: file.write(b"".join([len(text).to_bytes(8, "little"), text, *parts])))

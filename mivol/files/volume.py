@@ -15,7 +15,7 @@ import numpy as np
 
 from mivol.display import summarize, with_short_repr
 from mivol.errors import MivolError
-from mivol.files.notebook import slices_html
+from mivol.files.image_files import slices_html
 from mivol.files.source import refusal
 
 #: Smallest side of a box: the reciprocal of a denormal float32 number overflows.

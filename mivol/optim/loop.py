@@ -20,7 +20,7 @@ import mitsuba as mi
 
 from mivol.display import curve_html
 from mivol.errors import MivolError, WorkersLost
-from mivol.files.notebook import pairs_html
+from mivol.files.image_files import pairs_html
 from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.events import Event, checkpoints_first
 from mivol.optim.interrupt import InterruptGuard

@@ -16,10 +16,9 @@ from mivol.fields.gaussian_field import GaussianField
 from mivol.fields.hash_density import FittedDensity, HashDensity, TabulatedDensity
 from mivol.fields.protocol import Field
 from mivol.fields.sampled_field import SampledField
-from mivol.fields.sparse_voxels import SparseVoxels
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.transfer import Transfer
-from mivol.fields.voxels import Voxels, read_voxels
+from mivol.fields.voxels import SparseVoxels, Voxels, read_voxels
 from mivol.transport.media.octree_extinction import LeafField
 from mivol.transport.traversal.grid_blocks import find_stored_distances
 

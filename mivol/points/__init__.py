@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
-from mivol.points.cloud import PointCloud, read_points, write_points
-from mivol.points.conversions import gaussians_to_points, points_to_density, points_to_gaussians, sample_points
+from mivol.points.cloud import (
+    PointCloud,
+    gaussians_to_points,
+    points_to_density,
+    points_to_gaussians,
+    read_points,
+    sample_points,
+    write_points,
+)
 from mivol.points.gaussian_files import read_gaussians, write_gaussians
 from mivol.points.gaussians import Gaussians, concatenate
 

@@ -15,8 +15,15 @@ import numpy as np
 from mivol.display import format_point
 from mivol.errors import MivolError
 from mivol.files.source import check_file, refusal, select_by_suffix
-from mivol.points.cloud import CLOUD_READERS, CLOUD_WRITERS, PointCloud, read_points, write_points
-from mivol.points.conversions import gaussians_to_points, points_to_gaussians
+from mivol.points.cloud import (
+    CLOUD_READERS,
+    CLOUD_WRITERS,
+    PointCloud,
+    gaussians_to_points,
+    points_to_gaussians,
+    read_points,
+    write_points,
+)
 from mivol.points.gaussian_files import (
     GAUSSIAN_READERS,
     GAUSSIAN_WRITERS,

@@ -6,7 +6,8 @@ scale, printed beside the images. The same folder always gives the same bytes. S
 
 A sweep has a table of all runs with links to their pages. A result is drawn against each setting with at least two numbers as
 values: a point is a run, the line is the mean over the other settings. While runs are under way, a browser reads the page
-again every few seconds. The views of a reference on a cluster have the same page, a view in place of a run."""
+again every few seconds. The views of a reference on a cluster have the same page, a view in place of a run.
+"""
 
 from __future__ import annotations
 

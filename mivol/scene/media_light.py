@@ -29,9 +29,8 @@ from mivol.transport.estimators.lighting.direct_lighting import power_heuristic
 from mivol.transport.estimators.lighting.emission_sampling import EmissionTable, EmittingBox, tabulate_emission
 from mivol.transport.media.body import Body
 from mivol.transport.media.medium_view import MediumView, traverse_medium
-from mivol.transport.media.ray_intervals import RaySegment, find_end
+from mivol.transport.media.ray_intervals import RaySegment, draw_uniform_point, find_end
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.media.uniform_points import draw_uniform_point
 from mivol.transport.traversal.box import Box
 
 SAMPLING_COST = 2.0

@@ -28,8 +28,7 @@ from mivol.errors import MivolError, MivolWarning
 from mivol.files.atomic import lock_folder
 from mivol.optim.interrupt import InterruptGuard
 from mivol.photos.transforms import write_transforms
-from mivol.scene.description import content_hash
-from mivol.scene.load import LoadedScene, SceneSource, load_scene
+from mivol.scene.load import LoadedScene, SceneSource, content_hash, load_scene
 from mivol.scene.sensors import check_film, find_sensor, to_camera
 from mivol.validate.reference_file import (
     ReferenceResult,

@@ -6,7 +6,8 @@ cameras have OpenCV's axes and a vertical field of view [radian]. Sliders are sh
 The gate. Any program of this machine, and any web page in a browser of it, can reach a port of the loopback address. A request
 passes with the token in its address (``/?token=...``) or in the cookie that the answer to such a request sets; with a ``Host``
 of this machine (a foreign name that resolves to 127.0.0.1 is the attack called DNS rebinding); and, from a browser, with an
-``Origin`` of the page itself (pages may open web sockets to any host)."""
+``Origin`` of the page itself (pages may open web sockets to any host).
+"""
 
 from __future__ import annotations
 

@@ -5,7 +5,8 @@ them into a picture for a screen. ``space`` "srgb" means code values, "linear" m
 and a higher corner [length].
 
 A fit runs in another process and knows of no viewer: it writes its models as always, and the viewer reads the newest one. A
-viewer of an unfinished run takes the lowest priority of the operating system, so the fit keeps its cores."""
+viewer of an unfinished run takes the lowest priority of the operating system, so the fit keeps its cores.
+"""
 
 from __future__ import annotations
 

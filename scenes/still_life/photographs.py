@@ -22,7 +22,7 @@ from mivol.files.mesh import Mesh, write_mesh
 from mivol.photos import Camera, intrinsics
 from mivol.photos.camera_path import aim_camera
 from mivol.photos.transforms import write_transforms
-from mivol.scene.description import content_hash
+from mivol.scene.load import content_hash
 from mivol.scene.sensors import to_sensor
 
 import mitsuba as mi

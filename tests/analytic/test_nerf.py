@@ -13,7 +13,7 @@ from sampled_fields import OBLONG, random_points
 
 from mivol.errors import MivolError
 from mivol.fields.nerf import NerfField, NerfSizes
-from mivol.files.safetensors import read_safetensors, write_safetensors
+from mivol.files.npy import read_safetensors, write_safetensors
 from mivol.optim.photographs.sampled_problem import find_region
 
 FRAME = 0.0, 0.25, 1.5, 1.5

@@ -9,9 +9,9 @@ import pytest
 from ball_photos import CUBE
 
 from mivol.errors import MivolError
+from mivol.fields.bricks import SparseIndex
 from mivol.fields.harmonics import basis_size, harmonic_degree, row_width
 from mivol.fields.resampling import resample_field
-from mivol.fields.sparse_index import SparseIndex
 from mivol.fields.spherical_grid import SphericalGrid
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

@@ -11,9 +11,14 @@ from bounded_ball import Ball
 from mivol.errors import MivolError
 from mivol.transport.media.body import Body
 from mivol.transport.media.extinction import BoundedExtinction, RayInterval
-from mivol.transport.media.ray_intervals import RaySegment
+from mivol.transport.media.ray_intervals import (
+    RaySegment,
+    UniformPoint,
+    draw_uniform_point,
+    offer_medium_interval,
+    start_reservoirs,
+)
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.media.uniform_points import UniformPoint, draw_uniform_point, offer_medium_interval, start_reservoirs
 from scenes import ball_of, box_of, camera, centred, grid_volume, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

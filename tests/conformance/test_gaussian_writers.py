@@ -30,7 +30,7 @@ from mivol.files.image_files import decode_srgb
 from mivol.files.mesh import Atlas, Mesh, write_mesh
 from mivol.photos.camera_path import HomeView
 from mivol.points import Gaussians, read_gaussians, write_gaussians
-from mivol.points.gaussian_gltf import turn
+from mivol.points.gaussian_files import turn
 from mivol.points.sog import fit_palette, fit_table, morton_order
 from mivol.splatting import Splatter, to_tensors
 

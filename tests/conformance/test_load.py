@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.scene.description import NOT_UTF8, _printed_settings, content_hash, describe_error
-from mivol.scene.load import load_scene
+from mivol.scene.load import NOT_UTF8, _printed_settings, content_hash, describe_error, load_scene
 from mivol.threads import run_child
 
 INCLUDED = """<scene version="3.0.0">

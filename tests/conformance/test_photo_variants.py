@@ -20,8 +20,7 @@ from mivol.photos.lens import Lens
 from mivol.photos.listing import find_shrink
 from mivol.photos.photo_file import ORIENTATION, TURNS
 from mivol.points import read_gaussians, write_gaussians
-from mivol.points.gaussian_files import read_gaussian_view
-from mivol.points.gaussian_ply import write_gaussian_ply
+from mivol.points.gaussian_files import read_gaussian_view, write_gaussian_ply
 from mivol.points.gaussians import Gaussians
 
 BOX = np.array([[-1.0] * 3, [1.0] * 3])

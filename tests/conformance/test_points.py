@@ -10,8 +10,15 @@ import pytest
 from gaussian_sets import inria_bytes, ply_bytes, random_gaussians
 
 from mivol.errors import MivolError
-from mivol.points.cloud import PointCloud, read_points, write_points
-from mivol.points.conversions import gaussians_to_points, points_to_density, points_to_gaussians, sample_points
+from mivol.points.cloud import (
+    PointCloud,
+    gaussians_to_points,
+    points_to_density,
+    points_to_gaussians,
+    read_points,
+    sample_points,
+    write_points,
+)
 
 BOX = np.array([[2.0, 0.5, 0, -1], [0, 3, 0, 4], [0, 0, 1.5, 2], [0, 0, 0, 1]])
 """Unit cube to world: a sheared box of volume 9."""

@@ -24,7 +24,7 @@ from mivol.phase.measured import NAMES, named_medium
 from mivol.phase.table import Table
 from mivol.photos import Camera
 from mivol.photos.camera import PIXELS_LOST
-from mivol.scene.description import parse_dict, parse_file
+from mivol.scene.load import parse_dict, parse_file
 from mivol.scene.refusals import check_quadrature
 from mivol.scene.sensors import Ring, parse_rig, to_sensor
 from mivol.transport.path.estimators import Settings

@@ -34,8 +34,7 @@ from mivol.scene import plan
 from mivol.transport.estimators.flights.flight_derivatives import Probe, Probes, ShadowReservoir, ShadowTerm
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight
 from mivol.transport.estimators.segment import FlightPoint, PathSegment
-from mivol.transport.media.ray_intervals import RaySegment
-from mivol.transport.media.uniform_points import UniformPoint
+from mivol.transport.media.ray_intervals import RaySegment, UniformPoint
 from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
 from mivol.transport.traversal.rays import FineRay
 from mivol.validate.statistics import Moments

@@ -12,7 +12,8 @@ says how much sooner one method reaches an error.
 Agreement of two means: z, its bound by Student's t, and the smallest visible bias. Values are float64, one for each round; a
 round has its own seed. An error is the variance of a mean with the degrees of freedom of its estimate
 (:class:`mivol.validate.statistics.Estimate`). A time ratio of two methods is meaningless if their means differ, so every
-study of unbiased methods compares the means first."""
+study of unbiased methods compares the means first.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Bricks of sparse grids that appear and vanish between the stages of a fit.
 
 Conventions. ``data`` (bricks, 8, 8, 8, C) and ``bricks`` are the parameters of a sparse grid
-(:mod:`mivol.fields.sparse_voxels`). Bricks whose values are all at most a threshold vanish. Neighbours of the others, 26 a
+(:mod:`mivol.fields.voxels`). Bricks whose values are all at most a threshold vanish. Neighbours of the others, 26 a
 brick, appear if the gradient asks for them. A trial step with all neighbours at 0 measures the *pull* of each brick: by how
 much the loss falls if all its voxels rise. A neighbour appears if its pull exceeds the median size of the pulls of the
 stored bricks. These fall to the noise of the gradient as the fit converges; the sign alone would let in half of all neighbours

@@ -30,7 +30,7 @@ from typing import Protocol
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.media.channels import take_tangent
+from mivol.transport.media.extinction import take_tangent
 
 __all__ = [
     "FORWARD",

@@ -30,9 +30,8 @@ from mivol.transport.media.optical_depth import (
     transmittance,
     vjp_optical_depth,
 )
-from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
+from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd, UniformPoint
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.media.uniform_points import UniformPoint
 from mivol.transport.traversal.random_numbers import SpreadSampler, draw_pcg32, draw_state, fork_state
 from mivol.transport.traversal.rays import Ray
 

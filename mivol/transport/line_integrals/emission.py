@@ -31,8 +31,8 @@ from mivol.transport.estimators.segment import PathSegment, SegmentEstimate, Seg
 from mivol.transport.line_integrals.composite import Composite, composite_ray, vjp_composite
 from mivol.transport.line_integrals.integrand import LineIntegral, RayPiece
 from mivol.transport.media.body import medium_interaction
-from mivol.transport.media.channels import colours_to_channels, take_tangent, to_spectrum
 from mivol.transport.media.compositing import CellIntegral
+from mivol.transport.media.extinction import colours_to_channels, take_tangent, to_spectrum
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.media.ray_intervals import RaySegment, find_end

@@ -18,8 +18,15 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.transport.media.channels import to_part_channels, to_scene_channels, to_spectrum
-from mivol.transport.media.extinction import ExactExtinction, Extinction, RayInterval, Weight
+from mivol.transport.media.extinction import (
+    ExactExtinction,
+    Extinction,
+    RayInterval,
+    Weight,
+    to_part_channels,
+    to_scene_channels,
+    to_spectrum,
+)
 from mivol.transport.media.grid_extinction import SummedExtinction, add_to_cell, have_same_cells
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.box import UNIT_CUBE, Box, clip_to_ball, clip_to_box, is_in_box, opaque_numbers

@@ -16,7 +16,7 @@ from mivol.fields.harmonics import blocks_per_gaussian
 from mivol.numerics import fast_max, fast_min
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.traversal.box import UNIT_CUBE, Box, clip_to_box
-from mivol.transport.traversal.plane_walk import walk_planes
+from mivol.transport.traversal.grid_walk import walk_planes
 from mivol.transport.traversal.rays import Ray
 
 __all__ = ["GaussianExtinction", "Passage", "add_to_block"]

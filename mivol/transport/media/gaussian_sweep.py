@@ -35,12 +35,11 @@ import mitsuba as mi
 from mivol.fields.gaussian_line import ROW_SIZE, WhitenedLine, intersect_gaussian, read_row
 from mivol.fields.harmonics import eval_colour, eval_colour_slopes, read_harmonics, sum_harmonics
 from mivol.numerics import fast_max, fast_min, one_minus_exp
-from mivol.transport.media.channels import LUMINANCE
 from mivol.transport.media.compositing import BodyIntegral, CellIntegral, ReverseState, composite_over, pass_cell, zeros
-from mivol.transport.media.extinction import RayInterval
+from mivol.transport.media.extinction import LUMINANCE, RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction, add_to_block
 from mivol.transport.media.ray_intervals import MediumInterval
-from mivol.transport.traversal.plane_walk import walk_planes
+from mivol.transport.traversal.grid_walk import walk_planes
 
 __all__ = ["GaussianSweep", "visit_far_to_near"]
 

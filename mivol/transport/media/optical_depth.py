@@ -12,19 +12,21 @@ import mitsuba as mi
 
 from mivol.numerics import minimum
 from mivol.transport.media.body import Body
-from mivol.transport.media.channels import colours_to_channels, to_spectrum
-from mivol.transport.media.extinction import Weight
+from mivol.transport.media.extinction import Weight, colours_to_channels, to_spectrum
 from mivol.transport.media.ray_intervals import (
     MediumInterval,
+    PointReservoir,
     RaySegment,
     SegmentEnd,
     add_passage,
+    bounded_parts,
+    offer_medium_interval,
     revisit_media,
     start_passages,
+    start_reservoirs,
     visit_media,
 )
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.media.uniform_points import PointReservoir, bounded_parts, offer_medium_interval, start_reservoirs
 from mivol.transport.traversal.rays import Ray
 
 __all__ = [

@@ -22,7 +22,7 @@ import numpy as np
 
 from mivol.phase.closed_forms import INV_FOUR_PI, angle_between, eval_hg, sample_hg, scattered_direction
 from mivol.transport.media.body import Body, is_followed
-from mivol.transport.media.channels import to_scene_channels
+from mivol.transport.media.extinction import to_scene_channels
 from mivol.transport.traversal.box import opaque_numbers, opaque_rows
 from mivol.transport.traversal.rays import Ray, spawn_ray, to_mitsuba_ray
 

@@ -36,7 +36,7 @@ from mivol.transport.estimators.scores import IMAGE, Primal, Replay, Tangent, Tr
 from mivol.transport.estimators.segment import Collision, KnownFlight, PathSegment
 from mivol.transport.estimators.single_scattering.near_light import AimedDirections
 from mivol.transport.media.body import medium_interaction
-from mivol.transport.media.channels import to_components
+from mivol.transport.media.extinction import to_components
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.event import DirectionSamples, PathEvent, sample_next_direction

@@ -23,7 +23,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.media.body import Body, is_followed
-from mivol.transport.media.channels import to_components
+from mivol.transport.media.extinction import to_components
 from mivol.transport.media.grid_extinction import have_same_cells
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.box import map_point

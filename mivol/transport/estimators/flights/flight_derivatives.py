@@ -41,8 +41,7 @@ from mivol.transport.estimators.flights.gaussian_light import GaussianLight
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight
 from mivol.transport.estimators.segment import Collision, FlightPoint, PathSegment
 from mivol.transport.media.body import Body, emission_slope, eval_albedo, eval_emission
-from mivol.transport.media.channels import colours_to_channels, take_tangent, to_spectrum
-from mivol.transport.media.extinction import Weight
+from mivol.transport.media.extinction import Weight, colours_to_channels, take_tangent, to_spectrum
 from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth, vjp_rows
 from mivol.transport.media.ray_intervals import RaySegment, start_passages
 from mivol.transport.media.scene_media import SceneMedia

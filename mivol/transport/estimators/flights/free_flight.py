@@ -53,8 +53,14 @@ from mivol.transport.estimators.segment import (
     SegmentTransmittance,
 )
 from mivol.transport.media.body import Body, eval_albedo, medium_interaction
-from mivol.transport.media.channels import to_components, to_scene_channels, to_spectrum
-from mivol.transport.media.extinction import ExactExtinction, Extinction, RayInterval
+from mivol.transport.media.extinction import (
+    ExactExtinction,
+    Extinction,
+    RayInterval,
+    to_components,
+    to_scene_channels,
+    to_spectrum,
+)
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.grid_extinction import activate, clip_interval
 from mivol.transport.media.octree_extinction import OctreeExtinction
@@ -64,11 +70,11 @@ from mivol.transport.media.ray_intervals import (
     RaySegment,
     SegmentEnd,
     add_passage,
+    draw_uniform_point,
     start_passages,
     visit_media,
 )
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.media.uniform_points import draw_uniform_point
 from mivol.transport.traversal.grid_walk import Cell, NodeArray, corner_nodes, read_nodes, walk_cells
 from mivol.transport.traversal.interpolation import (
     fit_cubic,

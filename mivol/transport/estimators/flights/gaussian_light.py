@@ -19,8 +19,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.estimators.segment import PathSegment
-from mivol.transport.media.channels import to_components
 from mivol.transport.media.compositing import zeros
+from mivol.transport.media.extinction import to_components
 from mivol.transport.media.gaussian_sweep import GaussianSweep
 from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth
 from mivol.transport.media.ray_intervals import MediumInterval, RaySegment, revisit_media

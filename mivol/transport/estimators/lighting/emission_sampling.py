@@ -35,7 +35,7 @@ from mivol.transport.estimators.lighting.shadow_rays import find_transmittance
 from mivol.transport.estimators.lighting.vertex import Vertex
 from mivol.transport.estimators.scores import TrackedTerm
 from mivol.transport.media.body import Body, emission_slope, eval_emission
-from mivol.transport.media.channels import colours_to_channels, to_components, to_spectrum
+from mivol.transport.media.extinction import colours_to_channels, to_components, to_spectrum
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.box import Box

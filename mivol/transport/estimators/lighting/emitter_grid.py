@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.media.channels import to_components
+from mivol.transport.media.extinction import to_components
 from mivol.transport.traversal.rays import Ray
 
 __all__ = ["EmitterDistribution", "EmitterGrid", "tabulate_emitters"]

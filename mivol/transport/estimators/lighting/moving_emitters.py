@@ -18,8 +18,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.media.body import Body
-from mivol.transport.media.channels import to_spectrum
-from mivol.transport.media.extinction import ExactExtinction
+from mivol.transport.media.extinction import ExactExtinction, to_spectrum
 from mivol.transport.media.ray_intervals import OWN_SURFACE, MediumInterval, RaySegment, revisit_media
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.box import UNIT_CUBE, map_point, map_vector

@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from mivol.numerics import minimum
 from mivol.transport.estimators.flights.tracking import ratio_tracking, residual_ratio_tracking
-from mivol.transport.media.channels import to_scene_channels, to_spectrum
+from mivol.transport.media.extinction import to_scene_channels, to_spectrum
 from mivol.transport.media.grid_extinction import clip_interval
 from mivol.transport.media.optical_depth import integrate_optical_depth, segment_optical_depth, transmittance
 from mivol.transport.media.ray_intervals import (

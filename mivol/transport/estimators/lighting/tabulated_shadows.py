@@ -24,7 +24,7 @@ import numpy as np
 
 from mivol.transport.estimators.lighting.emitters import SceneEmitters
 from mivol.transport.estimators.lighting.shadow_rays import NEGLIGIBLE_TAU, trace_shadow_ray
-from mivol.transport.media.channels import to_spectrum
+from mivol.transport.media.extinction import to_spectrum
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.box import Box, map_point, opaque_rows
 from mivol.transport.traversal.interpolation import interpolate

@@ -31,7 +31,7 @@ from mivol.transport.estimators.single_scattering.control_variates import (
 )
 from mivol.transport.estimators.single_scattering.distance_sampling import MediumEvent
 from mivol.transport.media.body import eval_albedo, medium_interaction
-from mivol.transport.media.channels import colours_to_channels, take_tangent, to_components, to_spectrum
+from mivol.transport.media.extinction import colours_to_channels, take_tangent, to_components, to_spectrum
 from mivol.transport.media.optical_depth import jvp_optical_depth, transmittance, vjp_optical_depth
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia

@@ -38,7 +38,7 @@ from mivol.transport.estimators.segment import Absorption, PathSegment, SegmentE
 from mivol.transport.estimators.single_scattering.distance_sampling import lit_length
 from mivol.transport.estimators.single_scattering.single_scattering import SingleScattering
 from mivol.transport.media.body import Body, eval_albedo, medium_interaction
-from mivol.transport.media.channels import to_spectrum
+from mivol.transport.media.extinction import to_spectrum
 from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.media.ray_intervals import MediumInterval, RaySegment, visit_media
 from mivol.transport.media.scene_media import SceneMedia
