@@ -1,4 +1,4 @@
-"""A tree of dicts and lists against msgspec structs: the first fault in a sentence, and every setting on a line.
+"""A tree of dicts and lists against msgspec structs: the first fault in a sentence, every setting on a line, shared settings.
 
 Conventions. A place in the tree is a dotted key; entries of lists count from 0. If a setting has several possible structs,
 their tag tells which. msgspec checks types and domains; this module adds the nearest valid name, and refuses infinite numbers
@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 import re
 import textwrap
-from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -171,3 +172,42 @@ def describe(kind: type) -> list[str]:
             one_of = f" ({' | '.join(choices)})" if choices else ""
             lines.append(f"{key}{value}{f' [{unit}]' if unit != '1' else ''}: {meaning}{one_of}")
     return lines
+
+
+# -- Shared settings ---------------------------------------------------------------------------------------------------
+
+INFINITY = math.inf
+
+AUTO = "auto"
+"""Value of settings chosen by mivol."""
+
+Count = Annotated[int, msgspec.Meta(ge=1)]
+"""Number of voxels or pixels along an edge."""
+
+Depth = Annotated[int, msgspec.Meta(ge=-1)]
+"""Length of the longest path, as Mitsuba's ``volpath`` counts it; -1 for no limit."""
+
+Size = tuple[Count, Count, Count]
+Vector = tuple[float, float, float]
+Title = Annotated[str, setting("1", "heading of the report", min_length=1)]
+Variant = Annotated[str, setting("1", "Mitsuba variant", min_length=1)]
+Seed = Annotated[int, setting("1", "root of the fit's random numbers", ge=0)]
+Threads = Annotated[int, setting("thread", "threads of the CPU back end; 0: all cores", ge=0)]
+Output = Annotated[str, setting("path", "run folder, relative to the working directory", min_length=1)]
+HeldOut = Annotated[tuple[int, ...], setting("view", "indices of views that are evaluated but not fitted")]
+DetectorSize = Annotated[tuple[Count, Count], setting("pixel", "(rows, columns) of computed projections")]
+CheckpointSteps = Annotated[int, setting("step", "steps between two checkpoints", ge=1)]
+
+
+def check_word(word: str, known: Sequence[str] | dict[str, Any], subject: str) -> None:
+    """Refuse an unknown word, and offer the nearest known word.
+
+    Raises:
+        ValueError: with the word.
+    """
+    if word not in known:
+        raise ValueError(f'unknown {subject} "{word}": {suggest_name(word, list(known))}'.rstrip("."))
+
+
+class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A table of the file."""

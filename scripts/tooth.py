@@ -20,8 +20,8 @@ from pathlib import Path
 
 import mivol
 from mivol.files import ProjectionData, read_projections, whole_file, write_whole_text
+from mivol.optim.projections.inversion import SOLVERS
 from mivol.optim.projections.linear_problems import LeastSquares, SmoothedTV
-from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.preprocess import LightDrift, correct_transmission, fit_light_drift, normalise_air, to_line_integrals
 from mivol.tomography.projector import Projector

@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 import oracle_projector
 
+from mivol.optim.projections.inversion import SOLVERS
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SolverState
-from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import shepp_logan
 

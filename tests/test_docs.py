@@ -22,7 +22,7 @@ from mivol import config
 from mivol.bench.harness.catalogue import study_names
 from mivol.cli import parser
 from mivol.cluster import address
-from mivol.optim.projections.solvers import ALL_SOLVERS
+from mivol.optim.projections.inversion import ALL_SOLVERS
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -6,7 +6,7 @@ figures. The quick size is for CI, and its times mean nothing. Standard output h
 No other room of mivol imports this room, except ``cli/``.
 
 A new study is one file in ``studies/`` with a module docstring, whose first line is a question, and a constant ``STUDY``, its
-only public name. Bars on single figures are declared (:class:`~mivol.bench.harness.bars.Promise`).
+only public name. Bars on single figures are declared (:class:`~mivol.bench.harness.study.Promise`).
 
 Shared: ``harness`` (contests, bars, command line, figures), ``scenes`` (volumes, lights, and a walk of rays whose rate measures
 the speed of a machine) and ``photo_fits``.

@@ -19,9 +19,8 @@ import mitsuba as mi
 import numpy as np
 
 from mivol import config
-from mivol.bench.harness.bars import say
 from mivol.bench.harness.contests import Stopwatch
-from mivol.bench.harness.study import Size, amount
+from mivol.bench.harness.study import Size, amount, say
 from mivol.bench.scenes import CHECKOUT, DATA, measure_walk_rate, reference_seconds
 from mivol.errors import MivolError
 from mivol.experiments import gaussian_fit

@@ -46,10 +46,9 @@ from mivol.config.scans import (
     is_circle,
 )
 from mivol.config.scenes import Files, Rendered, SceneExperiment, Sought, Truth
-from mivol.config.sections import AUTO, Section
 from mivol.errors import MivolError
 from mivol.optim.strategy import suggest_name
-from mivol.schema import check_keys, explain_error
+from mivol.schema import AUTO, Section, check_keys, explain_error
 
 __all__ = [
     "AUTO", "CAPTURE", "Cone", "Detector", "EXPERIMENTS", "Ellipsoids", "Experiment", "FIELD_KINDS", "FieldExperiment",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from mivol.config.sections import (
+from mivol.optim.strategy import setting
+from mivol.schema import (
     CheckpointSteps,
     Output,
     Section,
@@ -15,7 +16,6 @@ from mivol.config.sections import (
     Vector,
     check_word,
 )
-from mivol.optim.strategy import setting
 from mivol.validate.metrics import METRICS
 
 

@@ -6,7 +6,9 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from mivol.config.sections import (
+from mivol.optim.projections.inversion import ALL_SOLVERS
+from mivol.optim.strategy import setting
+from mivol.schema import (
     AUTO,
     INFINITY,
     Count,
@@ -20,8 +22,6 @@ from mivol.config.sections import (
     Vector,
     check_word,
 )
-from mivol.optim.projections.solvers import ALL_SOLVERS
-from mivol.optim.strategy import setting
 from mivol.tomography.filtered import WINDOWS
 
 
@@ -265,7 +265,7 @@ class Grid(Section):
 class SolveSettings(Section):
     """Inversion of the projections."""
 
-    name: Annotated[str, setting("1", "auto, or a key of mivol.optim.projections.solvers.ALL_SOLVERS", min_length=1)] = AUTO
+    name: Annotated[str, setting("1", "auto, or a key of mivol.optim.projections.inversion.ALL_SOLVERS", min_length=1)] = AUTO
     start: Annotated[
         Literal["empty", "filtered"] | None,
         setting("1", "first volume; absent: auto takes filtered if the views allow it, others empty"),
@@ -313,7 +313,7 @@ class SolveSettings(Section):
 
     @property
     def solver(self) -> str:
-        """Key of ``mivol.optim.projections.solvers.ALL_SOLVERS``; "auto" stands for pcg."""
+        """Key of ``mivol.optim.projections.inversion.ALL_SOLVERS``; "auto" stands for pcg."""
         return "pcg" if self.name == AUTO else self.name
 
 

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from mivol.config.sections import (
+from mivol.optim.events import EVENTS, Checkpoint, Evaluate
+from mivol.optim.first_order import Adam
+from mivol.optim.losses import L2, LOSSES
+from mivol.optim.optimizer import SCHEDULES, Constant
+from mivol.optim.optimizers import OPTIMIZERS
+from mivol.optim.parameters import MAPS
+from mivol.optim.priors import PRIORS
+from mivol.optim.strategy import setting, union_type
+from mivol.scene.sensors import Hemisphere, LookAts, Ring, SceneSensors
+from mivol.schema import (
     AUTO,
     INFINITY,
     Depth,
@@ -18,15 +27,6 @@ from mivol.config.sections import (
     Variant,
     check_word,
 )
-from mivol.optim.events import EVENTS, Checkpoint, Evaluate
-from mivol.optim.first_order import Adam
-from mivol.optim.losses import L2, LOSSES
-from mivol.optim.optimizers import OPTIMIZERS
-from mivol.optim.parameters import MAPS
-from mivol.optim.priors import PRIORS
-from mivol.optim.schedules import SCHEDULES, Constant
-from mivol.optim.strategy import setting, union_type
-from mivol.scene.sensors import Hemisphere, LookAts, Ring, SceneSensors
 
 
 class Scene(Section):

@@ -17,8 +17,8 @@ from mivol.files import read_columns, read_volume
 from mivol.files.fetch import resolve_path
 from mivol.files.image_stack import ALL
 from mivol.machine import check_memory
+from mivol.optim.projections.inversion import ALL_SOLVERS
 from mivol.optim.projections.linear_problems import PoissonCounts
-from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.tomography.cone_axis import axis_from_fans, cone_axis_offset
 from mivol.tomography.filtered import covers_circle
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid

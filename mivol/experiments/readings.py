@@ -26,8 +26,8 @@ from mivol.files.mrc import read_tilt_angles
 from mivol.files.nikon import NikonScan, read_nikon, read_nikon_angles, read_nikon_transmission
 from mivol.files.scan_hdf5 import NO_DARKS, survey_projections
 from mivol.files.source import refusal
+from mivol.optim.projections.inversion import SOLVERS
 from mivol.optim.projections.linear_problems import LeastSquares, last_state
-from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import PanelViews, geometry_from_nikon
 from mivol.tomography.preprocess import Transmission, assume_quantum_noise, correct_transmission

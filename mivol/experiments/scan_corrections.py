@@ -13,9 +13,9 @@ from mivol import config
 from mivol.errors import MivolError
 from mivol.experiments.projections import Projections, grid_of_detector
 from mivol.optim.projections.alignment import Alignment, align_views
+from mivol.optim.projections.inversion import ALL_SOLVERS
 from mivol.optim.projections.linear_problems import PoissonCounts
 from mivol.optim.projections.scatter import fit_scatter
-from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector
 from mivol.tomography.single_material import fit_hardening

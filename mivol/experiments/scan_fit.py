@@ -47,9 +47,8 @@ from mivol.experiments.solver_choice import (
 from mivol.files import read_volume, write_exr, write_volume
 from mivol.optim.events import Checkpoint
 from mivol.optim.loop import Course, Fit
-from mivol.optim.projections.inversion import DriftFit, LinearSolve, ProjectionProblem, update_light
+from mivol.optim.projections.inversion import ALL_SOLVERS, DIRECT, DriftFit, LinearSolve, ProjectionProblem, update_light
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SolverState, expected_residual_norm
-from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.report.cameras import draw_scanner
 from mivol.report.figures import plot_moves, plot_ring_removal, save_figure
 from mivol.report.pixel_scale import is_preview_due, write_preview

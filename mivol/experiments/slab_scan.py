@@ -48,8 +48,8 @@ from mivol.files.tiff import TiffSlices
 from mivol.files.zarr import ZarrSlices
 from mivol.machine import peak_memory
 from mivol.optim.projections.disk_sweeps import DiskSweeps, SweepState
+from mivol.optim.projections.inversion import ALL_SOLVERS, DIRECT
 from mivol.optim.projections.linear_problems import last_state
-from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.report.page import write_page
 from mivol.report.pixel_scale import PREVIEW, write_preview
 from mivol.report.record import Image, PlanLine, RunRecord

@@ -19,7 +19,7 @@ from mivol.config import AUTO
 from mivol.errors import MivolError
 from mivol.experiments.projections import Projections
 from mivol.machine import check_memory
-from mivol.optim.projections.inversion import ProjectionProblem
+from mivol.optim.projections.inversion import ALL_SOLVERS, DIRECT, ProjectionProblem
 from mivol.optim.projections.iterative import projected_cg
 from mivol.optim.projections.linear_problems import (
     SmoothedTV,
@@ -28,7 +28,6 @@ from mivol.optim.projections.linear_problems import (
     last_state,
     scale_tv_to_noise,
 )
-from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.report.record import PlanLine
 from mivol.tomography.filtered import check_directions
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid, subdivide_grid

@@ -24,9 +24,8 @@ from mivol.files.image_files import pairs_html
 from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.events import Event, checkpoints_first
 from mivol.optim.interrupt import InterruptGuard
-from mivol.optim.optimizer import Optimizer, OptimizerRun
+from mivol.optim.optimizer import Constant, Optimizer, OptimizerRun, Schedule
 from mivol.optim.problem import Problem
-from mivol.optim.schedules import Constant, Schedule
 from mivol.threads import check_one_thread
 
 SAVED_FIELDS = ("next_iteration", "events_done", "history", "evaluations", "log", "has_warned", "seconds")

@@ -20,10 +20,10 @@ from mivol.display import format_point, with_short_repr
 from mivol.errors import MivolError
 from mivol.files.source import refusal
 from mivol.photos import app_exports, region
+from mivol.photos.app_exports import read_llff
 from mivol.photos.camera import Camera, field_of_view
 from mivol.photos.colmap import find_model, read_colmap
 from mivol.photos.listing import UNLISTED, Entry, Listing, find_mask, find_shrink, list_photographs, name_first
-from mivol.photos.llff import read_llff
 from mivol.photos.photo_file import PhotoHeader, read_photo_header
 from mivol.photos.transforms import read_blender, read_transforms
 

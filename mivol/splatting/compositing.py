@@ -28,8 +28,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mivol.splatting.projection import EXP2
-from mivol.splatting.tile_lists import TILE, Grid
+from mivol.splatting.projection import EXP2, TILE, Grid
 
 CHUNK = 4
 """Entries between two stored values of T."""

@@ -23,8 +23,23 @@ from mivol.kernel_recording import copy_aligned, ensure_aligned, record_kernels
 from mivol.photos.camera import Camera
 from mivol.points import Gaussians
 from mivol.splatting.compositing import CHUNK, LANES, PIXELS, Adjoint, Frame, Lists, composite, composite_adjoint
-from mivol.splatting.projection import EXP2, Cloud, Filter, Splats, View, pack_view, project
-from mivol.splatting.tile_lists import TILE, Grid, TileLists, check_memory, count_tiles, list_tiles, nearest_first, write_tiles
+from mivol.splatting.projection import (
+    EXP2,
+    TILE,
+    Cloud,
+    Filter,
+    Grid,
+    Splats,
+    TileLists,
+    View,
+    check_memory,
+    count_tiles,
+    list_tiles,
+    nearest_first,
+    pack_view,
+    project,
+    write_tiles,
+)
 from mivol.threads import check_one_thread
 
 NAMES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics")

@@ -25,7 +25,7 @@ from mivol.fields.procedural import make_procedural
 from mivol.files import read_volume, write_volume
 from mivol.files.fetch import PREFIX, find_local_file, resolve_path
 from mivol.optim.projections.linear_problems import LeastSquares
-from mivol.optim.projections.solvers import SOLVERS
+from mivol.optim.projections.inversion import SOLVERS
 from mivol.validate.metrics import nrmse
 
 import mitsuba as mi

@@ -19,16 +19,6 @@ from scipy import stats
 from tiny_experiment import refused, run
 
 from mivol.bench.harness import catalogue, contests
-from mivol.bench.harness.bars import (
-    AT_LEAST,
-    AT_MOST,
-    Promise,
-    find_disagreements,
-    judge,
-    judge_agreement,
-    judge_promises,
-    say_row,
-)
 from mivol.bench.harness.contests import (
     FALSE_ALARM,
     Contest,
@@ -44,7 +34,22 @@ from mivol.bench.harness.contests import (
     ratio_of,
 )
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
-from mivol.bench.harness.study import Size, Study, SweptQuestion, amount, ask, without_arrays
+from mivol.bench.harness.study import (
+    AT_LEAST,
+    AT_MOST,
+    Promise,
+    Size,
+    Study,
+    SweptQuestion,
+    amount,
+    ask,
+    find_disagreements,
+    judge,
+    judge_agreement,
+    judge_promises,
+    say_row,
+    without_arrays,
+)
 from mivol.errors import MivolError
 from mivol.report.figures import STYLE
 from mivol.validate.statistics import Estimate

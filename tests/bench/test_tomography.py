@@ -18,8 +18,8 @@ from mivol.bench.studies import tomography as study
 from mivol.bench.studies.tomography import peers
 from mivol.bench.studies.tomography.peers import MeasuredSlice, Slice, centre_axis, load_tooth, make_slice
 from mivol.files import write_volume
+from mivol.optim.projections.inversion import ALL_SOLVERS
 from mivol.optim.projections.linear_problems import LeastSquares
-from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.tomography.filtered import filtered_backprojection
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import random_ellipsoids, shepp_logan

@@ -9,9 +9,9 @@ from mivol.config import ScanExperiment, SceneExperiment, Sought
 from mivol.optim.events import Checkpoint, Evaluate, UpdateOccupancy
 from mivol.optim.first_order import Adam
 from mivol.optim.losses import L2
+from mivol.optim.optimizer import Constant
 from mivol.optim.priors import DecoupledPrior, Smoothness, Sparsity, ViewDependence
 from mivol.optim.projections.inversion import LinearSolve
-from mivol.optim.schedules import Constant
 
 DEFAULTS = {
     SceneExperiment: {

@@ -10,8 +10,8 @@ import pytest
 from oracle_projector import ANGLES, GRID, assert_pair_is_adjoint, assert_pair_is_its_twin, numbers
 
 from mivol.errors import MivolError
+from mivol.optim.projections.inversion import SOLVERS
 from mivol.optim.projections.linear_problems import LeastSquares
-from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography import stored
 from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector

@@ -17,7 +17,7 @@ from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.events import Upsample
 from mivol.optim.losses import L2, LOSSES, Huber
 from mivol.optim.parameters import Parameter
-from mivol.optim.projections.solvers import fdk
+from mivol.optim.projections.inversion import fdk
 from mivol.optim.strategy import choose, make_table
 from mivol.phase.closed_forms import droplets
 from mivol.phase.measured import NAMES, named_medium

@@ -21,8 +21,8 @@ from mivol.experiments.slab_scan import SlabPlan, plan_slabs, reconstruct_slab, 
 from mivol.files import read_volume, write_volume
 from mivol.files.image_stack import read_stack, stack_shape
 from mivol.optim.projections.disk_sweeps import DiskSweeps
+from mivol.optim.projections.inversion import SOLVERS
 from mivol.optim.projections.linear_problems import LeastSquares
-from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.projector import Projector

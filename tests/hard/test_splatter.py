@@ -13,7 +13,7 @@ from mivol.photos.camera import Camera, intrinsics
 from mivol.splatting import Splatter
 from mivol.splatting import splatter as module
 from mivol.splatting.compositing import STOP
-from mivol.splatting.tile_lists import check_memory, nearest_first
+from mivol.splatting.projection import check_memory, nearest_first
 
 SIDE = 24
 ROUNDING = 4e-5

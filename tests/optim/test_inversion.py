@@ -11,6 +11,7 @@ from small_scan import VIEWS, Views, run
 from mivol.errors import MivolError
 from mivol.optim.loop import Course, reconstruct
 from mivol.optim.projections.inversion import (
+    SOLVERS,
     DriftFit,
     LinearSolve,
     ProjectionProblem,
@@ -18,7 +19,6 @@ from mivol.optim.projections.inversion import (
     update_light,
 )
 from mivol.optim.projections.linear_problems import LeastSquares, SolverState
-from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography.preprocess import LightDrift
 from mivol.tomography.rings import PixelGains
 

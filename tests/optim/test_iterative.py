@@ -15,9 +15,9 @@ from small_scan import GRID, VIEWS, Views, problem_for, run
 
 from mivol.cite import list_citations
 from mivol.optim.projections import iterative, linear_problems
+from mivol.optim.projections.inversion import SOLVERS
 from mivol.optim.projections.iterative import _Counts
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SmoothedTV, SolverState, last_state
-from mivol.optim.projections.solvers import SOLVERS
 
 
 @pytest.mark.parametrize("name", ["sirt", "os-sart"])

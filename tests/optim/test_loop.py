@@ -20,14 +20,13 @@ from mivol.optim.first_order import Adam, RMSprop
 from mivol.optim.interrupt import Interrupted, InterruptGuard
 from mivol.optim.loop import Course, reconstruct
 from mivol.optim.losses import Huber, Log
-from mivol.optim.optimizer import OptimizerRun
+from mivol.optim.optimizer import Cosine, OptimizerRun
 from mivol.optim.optimizers import OPTIMIZERS
 from mivol.optim.parameters import Parameter
 from mivol.optim.priors import Laplacian, TotalVariation
 from mivol.optim.scenes import scene_problem
 from mivol.optim.scenes.scene_problem import SceneProblem, draw_views
 from mivol.optim.scenes.views import View, derive_seed, make_batches
-from mivol.optim.schedules import Cosine
 from mivol.optim.second_order import GaussNewton, Lbfgs, Packing, apply_inverse_hessian, conjugate_gradients
 from mivol.validate.statistics import Moments
 

@@ -18,9 +18,8 @@ from mivol.optim.events import CoarseToFine
 from mivol.optim.first_order import Adam, RMSprop
 from mivol.optim.interrupt import Interrupted
 from mivol.optim.loop import Course, Fit, reconstruct
-from mivol.optim.optimizer import Optimizer
+from mivol.optim.optimizer import Cosine, Optimizer
 from mivol.optim.problem import Reals, Refinement
-from mivol.optim.schedules import Cosine
 
 X = np.linspace(-1, 1, 64, dtype=np.float32)
 SPLIT = 40

@@ -18,8 +18,8 @@ from scipy import stats
 
 from mivol.errors import MivolError
 from mivol.files import ProjectionData, read_projections, read_volume
+from mivol.optim.projections.inversion import SOLVERS
 from mivol.optim.projections.linear_problems import LeastSquares
-from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import random_ellipsoids
 from mivol.tomography.preprocess import Transmission, correct_transmission, fit_light_drift, normalise_air, to_line_integrals

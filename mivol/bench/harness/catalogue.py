@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from mivol.bench import studies
-from mivol.bench.harness.bars import say
-from mivol.bench.harness.study import Answer, Size, Study, SweptQuestion
+from mivol.bench.harness.study import Answer, Size, Study, SweptQuestion, say
 from mivol.cluster.connection import open_pool
 from mivol.cluster.pool import Pool, Unit
 from mivol.cluster.workplace import Workplace

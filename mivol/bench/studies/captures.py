@@ -22,8 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from mivol.bench.harness.bars import say_row
-from mivol.bench.harness.study import Size, Study, amount, ask
+from mivol.bench.harness.study import Size, Study, amount, ask, say_row
 from mivol.bench.photo_fits import PhotoProblem, prepare_fit
 from mivol.errors import MivolError
 from mivol.optim.loop import begin_fit

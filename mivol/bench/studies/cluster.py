@@ -24,8 +24,7 @@ import numpy as np
 
 from mivol import config
 from mivol.back_end import choose_back_end
-from mivol.bench.harness.bars import AT_MOST, Promise
-from mivol.bench.harness.study import Size, Study, amount
+from mivol.bench.harness.study import AT_MOST, Promise, Size, Study, amount
 from mivol.bench.studies.cluster_kills import write_experiments
 from mivol.cluster.connection import open_pool
 from mivol.cluster.distribution import ClusterDistribution

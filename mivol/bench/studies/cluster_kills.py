@@ -23,9 +23,8 @@ import numpy as np
 
 from mivol import config
 from mivol.back_end import choose_back_end
-from mivol.bench.harness.bars import AT_MOST, Promise, say
 from mivol.bench.harness.catalogue import answer_on
-from mivol.bench.harness.study import Size, Study, amount, ask
+from mivol.bench.harness.study import AT_MOST, Promise, Size, Study, amount, ask, say
 from mivol.bench.studies.preparation import PreparationSize, measure_axis
 from mivol.cluster.connection import open_pool
 from mivol.cluster.distribution import ClusterDistribution

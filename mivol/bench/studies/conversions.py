@@ -18,9 +18,8 @@ from tempfile import TemporaryDirectory
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.harness.bars import say_row
 from mivol.bench.harness.contests import Stopwatch
-from mivol.bench.harness.study import Study, amount
+from mivol.bench.harness.study import Study, amount, say_row
 from mivol.bench.photo_fits import FittedProblem, PhotoSize, find_photographs, prepare_fit
 from mivol.experiments import field_fit
 from mivol.experiments.field_conversion import (

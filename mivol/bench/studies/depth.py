@@ -20,9 +20,8 @@ import mitsuba as mi
 import numpy as np
 from matplotlib import colormaps
 
-from mivol.bench.harness.bars import AT_MOST, Bar, judge, say_row
 from mivol.bench.harness.figures import new_figure
-from mivol.bench.harness.study import Size, Study, SweptQuestion, amount
+from mivol.bench.harness.study import AT_MOST, Bar, Size, Study, SweptQuestion, amount, judge, say_row
 from mivol.scene.depth_two import ALBEDOS, TAUS, depth_two_error, sample_lines
 from mivol.transport.traversal.box import Box
 

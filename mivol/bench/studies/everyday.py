@@ -40,7 +40,6 @@ import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 
-from mivol.bench.harness.bars import AT_LEAST, Bar, Promise, judge_agreement, say_row
 from mivol.bench.harness.contests import (
     agreement_figures,
     compare_means,
@@ -52,7 +51,7 @@ from mivol.bench.harness.contests import (
     render_method,
 )
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
-from mivol.bench.harness.study import Size, Study, amount
+from mivol.bench.harness.study import AT_LEAST, Bar, Promise, Size, Study, amount, judge_agreement, say_row
 from mivol.bench.scenes import ParameterGradient, camera, make_integrator
 from mivol.errors import MivolError
 from mivol.optim.strategy import suggest_name

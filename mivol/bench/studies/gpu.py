@@ -18,10 +18,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.harness.bars import AT_LEAST, Promise, say_row
 from mivol.bench.harness.contests import Stopwatch
 from mivol.bench.harness.figures import new_figure, show_images
-from mivol.bench.harness.study import Study, amount, ask
+from mivol.bench.harness.study import AT_LEAST, Promise, Study, amount, ask, say_row
 from mivol.bench.photo_fits import PhotoSize, find_photographs, prepare_fit_in_time
 from mivol.fields.hash_grid import HashField
 from mivol.optim.loop import begin_fit

@@ -22,10 +22,9 @@ import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 
-from mivol.bench.harness.bars import Bar, judge_agreement, say_row
 from mivol.bench.harness.contests import BudgetSize, Contest, Method, compare_means, compete, contest_images, mean_of_rounds
 from mivol.bench.harness.figures import new_figure, plot_errors, use_plain_ticks
-from mivol.bench.harness.study import Study, amount
+from mivol.bench.harness.study import Bar, Study, amount, judge_agreement, say_row
 from mivol.bench.scenes import ParameterGradient, box_scene, constant_light, make_integrator, smoke, sun_and_sky
 from mivol.validate.statistics import Moments
 

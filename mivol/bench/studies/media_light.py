@@ -17,10 +17,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mivol.bench.harness.bars import AT_LEAST, Bar, Promise, judge_agreement, say_row
 from mivol.bench.harness.contests import agreement_figures, contest_images, gain_figures
 from mivol.bench.harness.figures import new_figure
-from mivol.bench.harness.study import Study, ask
+from mivol.bench.harness.study import AT_LEAST, Bar, Promise, Study, ask, judge_agreement, say_row
 from mivol.bench.scenes import perspective
 from mivol.bench.studies.single_scattering import ContestSize
 from mivol.report.figures import FAINT

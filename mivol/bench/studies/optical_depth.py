@@ -27,9 +27,8 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Promise
 from mivol.bench.harness.contests import Contestant, peak_bytes, race, ratio_of, time_call
-from mivol.bench.harness.study import Size, Study, amount
+from mivol.bench.harness.study import AT_LEAST, AT_MOST, Promise, Size, Study, amount
 from mivol.bench.scenes import (
     TO_WORLD,
     Extinction,

@@ -33,10 +33,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Promise, say_row
 from mivol.bench.harness.contests import Contestant, Timing, race, ratio_of
 from mivol.bench.harness.figures import new_figure, show_images
-from mivol.bench.harness.study import Size, Study, amount, ask
+from mivol.bench.harness.study import AT_LEAST, AT_MOST, Promise, Size, Study, amount, ask, say_row
 from mivol.bench.photo_fits import find_data, fit_photographs, prepare_fit
 from mivol.bench.scenes import DATA, REFERENCE_RATE, reference_walk
 from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, HARMONICS

@@ -29,8 +29,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mivol import config
-from mivol.bench.harness.bars import say_row
-from mivol.bench.harness.study import Size, Study, SweptQuestion, amount
+from mivol.bench.harness.study import Size, Study, SweptQuestion, amount, say_row
 from mivol.experiments.projections import Projections
 from mivol.experiments.scan_fit import start_volume
 from mivol.experiments.solver_choice import (

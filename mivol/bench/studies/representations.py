@@ -25,10 +25,9 @@ import numpy as np
 from drjit.hashgrid import HashGridEncoding
 from matplotlib.ticker import MaxNLocator
 
-from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Promise, say_row
 from mivol.bench.harness.contests import Stopwatch, race, ratio_of
 from mivol.bench.harness.figures import new_figure, show_images
-from mivol.bench.harness.study import Study, amount, ask
+from mivol.bench.harness.study import AT_LEAST, AT_MOST, Promise, Study, amount, ask, say_row
 from mivol.bench.photo_fits import FittedProblem, PhotoSize, find_photographs, fit_photographs, prepare_fit, prepare_fit_in_time
 from mivol.bench.scenes import REFERENCE_RATE, TO_WORLD, box_scene, constant_light, make_integrator, smoke
 from mivol.errors import MivolError

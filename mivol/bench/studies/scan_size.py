@@ -36,8 +36,7 @@ from typing import Any
 import numpy as np
 
 from mivol import config
-from mivol.bench.harness.bars import say_row
-from mivol.bench.harness.study import Size, Study, amount
+from mivol.bench.harness.study import Size, Study, amount, say_row
 from mivol.errors import MivolError
 from mivol.experiments.fit_kind import NullProgress, RunContext
 from mivol.experiments.slab_scan import STATE, plan_slabs, reconstruct_slab, run_slabs

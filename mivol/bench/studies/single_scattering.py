@@ -50,10 +50,9 @@ import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 
-from mivol.bench.harness.bars import AT_LEAST, Bar, Promise, judge_agreement, say_row
 from mivol.bench.harness.contests import BudgetSize, agreement_figures, contest_images, gain_figures, image_errors
 from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios, use_plain_ticks
-from mivol.bench.harness.study import Study, amount, ask
+from mivol.bench.harness.study import AT_LEAST, Bar, Promise, Study, amount, ask, judge_agreement, say_row
 from mivol.bench.scenes import (
     Extinction,
     as_dense_as_smoke,

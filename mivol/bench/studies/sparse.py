@@ -28,7 +28,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, Promise, judge_agreement
 from mivol.bench.harness.contests import (
     Contestant,
     agreement_figures,
@@ -41,7 +40,7 @@ from mivol.bench.harness.contests import (
     race,
     render_method,
 )
-from mivol.bench.harness.study import Size, Study, amount
+from mivol.bench.harness.study import AT_LEAST, AT_MOST, Bar, Promise, Size, Study, amount, judge_agreement
 from mivol.bench.scenes import DATA, TO_WORLD, camera_rays, threads_in_space
 from mivol.bench.studies.optical_depth import shuffle
 from mivol.errors import MivolError

@@ -49,10 +49,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, judge, say_row
 from mivol.bench.harness.contests import Stopwatch
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
-from mivol.bench.harness.study import Question, Size, Study, amount, ask
+from mivol.bench.harness.study import AT_LEAST, AT_MOST, Bar, Question, Size, Study, amount, ask, judge, say_row
 from mivol.bench.photo_fits import PhotoSize, find_photographs, prepare_fit
 from mivol.bench.scenes import box_scene, smoke
 from mivol.bench.studies.everyday import EverydayScene, chosen_scenes

@@ -27,8 +27,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from mivol.back_end import choose_back_end
-from mivol.bench.harness.bars import AT_MOST, Promise
-from mivol.bench.harness.study import Size, Study, amount, ask
+from mivol.bench.harness.study import AT_MOST, Promise, Size, Study, amount, ask
 from mivol.bench.studies.storage import make_field
 from mivol.errors import MivolError
 from mivol.experiments.examples import copy_example

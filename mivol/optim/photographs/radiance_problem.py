@@ -36,6 +36,7 @@ from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.batch_gradient import (
     FieldModel,
     GradientSettings,
+    MovingCameras,
     differentiate_batch,
     differentiate_tiles,
     find_errors,
@@ -43,7 +44,6 @@ from mivol.optim.photographs.batch_gradient import (
     move_numbers,
     move_rows,
 )
-from mivol.optim.photographs.moving_cameras import MovingCameras
 from mivol.optim.photographs.photo_colours import AGREE, GAIN_RATE, SCALES, Exposure, pull_at
 from mivol.optim.photographs.radiance_plan import RadiancePlan
 from mivol.optim.photographs.ray_batches import POINTS_PER_VIEW, DepthRays, RayBatch, RayBatches, sample_depth_rays

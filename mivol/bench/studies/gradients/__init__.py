@@ -57,10 +57,9 @@ import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 
-from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Bar, Promise, judge, judge_agreement, say_row
 from mivol.bench.harness.contests import SEED_STRIDE, Contest, compare_means, compete, finite_or_none, mean_of_rounds
 from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios
-from mivol.bench.harness.study import Study, amount, ask
+from mivol.bench.harness.study import AT_LEAST, AT_MOST, Bar, Promise, Study, amount, ask, judge, judge_agreement, say_row
 from mivol.bench.scenes import (
     Extinction,
     ParameterGradient,

@@ -18,9 +18,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.harness.bars import say_row
 from mivol.bench.harness.contests import Stopwatch, compare_means, mean_of_rounds
-from mivol.bench.harness.study import Size, amount
+from mivol.bench.harness.study import Size, amount, say_row
 from mivol.bench.scenes import DENSITY, TUTORIAL_SCALE, box_scene, constant_light, make_integrator, perspective, smoke
 from mivol.bench.studies.gradients.twin import ALBEDO, INTEGRATORS
 from mivol.validate.metrics import nrmse

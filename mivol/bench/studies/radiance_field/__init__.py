@@ -36,10 +36,9 @@ import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 
-from mivol.bench.harness.bars import AT_LEAST, AT_MOST, Promise, say_row
 from mivol.bench.harness.contests import Stopwatch, race, ratio_of
 from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios
-from mivol.bench.harness.study import Study, amount
+from mivol.bench.harness.study import AT_LEAST, AT_MOST, Promise, Study, amount, say_row
 from mivol.bench.photo_fits import PhotoSize, find_photographs, fit_photographs, prepare_fit
 from mivol.bench.studies.radiance_field.contestants import (
     BLACK,

@@ -35,10 +35,9 @@ import mitsuba as mi
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from mivol.bench.harness.bars import AT_MOST, Bar, judge, judge_agreement, say, say_row
 from mivol.bench.harness.contests import compare_means, mean_of_rounds
 from mivol.bench.harness.figures import new_figure
-from mivol.bench.harness.study import Size, Study, SweptQuestion, amount
+from mivol.bench.harness.study import AT_MOST, Bar, Size, Study, SweptQuestion, amount, judge, judge_agreement, say, say_row
 from mivol.bench.scenes import (
     as_dense_as_smoke,
     box_scene,

@@ -34,14 +34,13 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from mivol.bench.harness.bars import say, say_row
 from mivol.bench.harness.contests import Stopwatch, fastest
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
-from mivol.bench.harness.study import Size, Study, amount
+from mivol.bench.harness.study import Size, Study, amount, say, say_row
 from mivol.bench.studies.tomography.peers import error_rows, measure_peers, measure_tooth, ratio_rows
 from mivol.files import read_volume
+from mivol.optim.projections.inversion import SOLVERS
 from mivol.optim.projections.linear_problems import LeastSquares, SmoothedTV
-from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid, tigre_cone_beam
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.projector import Projector

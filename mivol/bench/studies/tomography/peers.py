@@ -29,14 +29,13 @@ import numpy as np
 from scipy.ndimage import shift
 
 from mivol import config
-from mivol.bench.harness.bars import say
+from mivol.bench.harness.study import say
 from mivol.experiments.examples import examples_folder
 from mivol.experiments.projections import Projections, fitted_views, held_out_views, make_data, make_grid
 from mivol.experiments.scan_fit import start_volume
 from mivol.experiments.solver_choice import choose_storage, estimate_noise, make_prior, resolve_solver
-from mivol.optim.projections.inversion import ProjectionProblem
+from mivol.optim.projections.inversion import ALL_SOLVERS, ProjectionProblem
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts
-from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.tomography.filtered import filtered_backprojection
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid, subdivide_grid, voxel_means
 from mivol.tomography.phantoms import shepp_logan
