@@ -17,8 +17,8 @@ Sources, looked up in programs that read them (nerfstudio, polyform, usa, brush)
   ``k1`` to ``k4``, ``t1`` and ``t2`` are those of :class:`~mivol.photos.lens.Lens`. Columns of the lens may be missing.
 * LLFF: ``poses_bounds.npy`` beside a folder ``images``. Each row holds 17 numbers: a matrix of 3 x 5, row by row, and the
   nearest and the farthest distance of visible matter along the optical axis. The columns of the matrix are the camera's axes in
-  the world (down, right, backwards), its position, and height, width and focal length in pixels. Rows belong to the photographs in
-  the order of their names (Mildenhall et al. 2019, Local Light Field Fusion, "Using your own poses without running COLMAP").
+  the world (down, right, backwards), its position, and height, width and focal length in pixels. Rows belong to the photographs
+  in the order of their names (Mildenhall et al. 2019, Local Light Field Fusion, "Using your own poses without running COLMAP").
 """
 
 from __future__ import annotations
