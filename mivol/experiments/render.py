@@ -43,7 +43,7 @@ SAMPLES_PER_PASS = 1 << 21
 KEPT = 2 * 4 * 8
 """Memory per pixel beside a pass [byte]: the sum of four channels in float64, and the pass during the addition."""
 
-COLOURS = {1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
+COLOURS = {0: (), 1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
 
 def check_output(path: Path) -> None:
@@ -131,19 +131,46 @@ def render_image(
     for (_, part), (image, _) in zip(parts, (passes or render_in_turn(scene, camera, integrator))(parts), strict=True):
         total = total + part * image.astype(np.float64)
     image = total / spp
-    aovs = list(integrator.aov_names())
-    return image, [*COLOURS[image.shape[2] - len(aovs)], *aovs]
+    return image, name_channels(list(integrator.aov_names()), image.shape[2])
+
+
+def name_channels(aovs: list[str], count: int) -> list[str]:
+    """Names of the channels of a rendered image.
+
+    Mitsuba's ``aov`` names four colours of each integrator inside, with a prefix, but renders the colours of the film. Those of
+    the first one are the image, without a prefix.
+
+    Args:
+        aovs: the integrator's ``aov_names()``.
+        count: channels of the image.
+    """
+    inside = [name[:-2] for name in aovs if name.endswith(".A")]
+    colours_inside = {f"{prefix}.{letter}" for prefix in inside for letter in "RGBA"}
+    others = len([name for name in aovs if name not in colours_inside])
+    colours = COLOURS[(count - others) // max(len(inside), 1)]
+    if not inside:
+        return [*colours, *aovs]
+    names = []
+    for name in aovs:
+        prefix = name[:-2]
+        if name not in colours_inside:
+            names.append(name)
+        elif name.endswith(".R"):
+            names += colours if prefix == inside[0] else [f"{prefix}.{letter}" for letter in colours]
+    return names
 
 
 def write_image(path: Path, image: np.ndarray, names: list[str]) -> None:
     """Write an image in the format of the file's suffix.
 
     Raises:
-        MivolError: another suffix than .exr or .png, or a disk error.
+        MivolError: another suffix than .exr or .png, a .png without colours, or a disk error.
     """
     check_output(path)
     if path.suffix.lower() == ".png":
         colours = [number for number, name in enumerate(names) if name in "RGBY"]
+        if not colours:
+            raise MivolError(f"the image has no colours, only {', '.join(names)}: write it as .exr.")
         return write_png(path, image[..., colours])
     return write_exr(path, {name: image[..., number].astype(np.float32) for number, name in enumerate(names)})
 

@@ -11,6 +11,7 @@ reference has no alpha: the background belongs to the scene.
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -216,7 +217,7 @@ class RenderSetup:
         Raises:
             MivolError: a ``max_spp`` too small for enough batches.
         """
-        spp = _effective_spp(self.sensor, wanted or _choose_pass_spp(self.shape[0] * self.shape[1], max_spp))
+        spp = _effective_spp(self.sensor, wanted or _choose_pass_spp(self.sensor, self.shape[0] * self.shape[1], max_spp))
         if spp * MIN_BATCHES > max_spp:
             raise MivolError(
                 f"{max_spp} samples are too few for {MIN_BATCHES} batches of {spp}; allow {spp * MIN_BATCHES} or more."
@@ -278,9 +279,12 @@ def _effective_spp(sensor: mi.Sensor, spp: int) -> int:
     return int(sampler.sample_count())
 
 
-def _choose_pass_spp(pixels: int, max_spp: int) -> int:
+def _choose_pass_spp(sensor: mi.Sensor, pixels: int, max_spp: int) -> int:
+    """The most samples of a pass; for a sampler that rounds numbers up, a square number that it keeps."""
     paths = PATHS_PER_PASS["cuda" if mi.variant().startswith("cuda") else "llvm"]
-    return max(1, min(paths // pixels, max_spp // MIN_BATCHES))
+    most = max(1, min(paths // pixels, max_spp // MIN_BATCHES))
+    squares = (k * k for k in range(math.isqrt(most), 0, -1))
+    return next((spp for spp in (most, *squares) if _effective_spp(sensor, spp) == spp), 1)
 
 
 def _base_seed(seed: int) -> int:

@@ -25,6 +25,31 @@ def test_render_in_passes_is_the_mean(variant_rgb, folder: Path, monkeypatch: py
     assert not np.array_equal(split, once)
 
 
+@pytest.mark.parametrize("colours", ["luminance", "rgb", "rgba"])
+@pytest.mark.parametrize("inside", [0, 1, 2])
+def test_channels_of_integrators_inside_aov_have_names(variant_rgb, colours: str, inside: int) -> None:
+    """Values and names of each channel are those of the same integrator alone; the first has the plain names."""
+    film = {"type": "hdrfilm", "width": 8, "height": 6, "pixel_format": colours, "rfilter": {"type": "box"}}
+    place = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    camera = {"type": "perspective", "to_world": place, "film": film}
+    scene = mi.load_dict({"type": "scene", "camera": camera, "ball": {"type": "sphere"}, "sky": {"type": "constant"}})
+    kinds = {"first": "direct", "second": "depth"}
+    parts = {name: {"type": kinds[name]} for name in list(kinds)[:inside]}
+    image, names = render.render_image(scene, 0, mi.load_dict({"type": "aov", "aovs": "far:depth", **parts}))
+    own = {"luminance": "Y", "rgb": "RGB", "rgba": "RGBA"}[colours]
+    expected = [*own[: len(own) * bool(inside)], *(f"second.{letter}" for letter in own if inside == 2), "far.T"]
+    assert names == expected and image.shape == (6, 8, len(names))
+    for prefix, part in zip(("", "second.")[:inside], parts.values(), strict=True):
+        alone, _ = render.render_image(scene, 0, mi.load_dict(part))
+        found = image[..., [names.index(prefix + letter) for letter in own]]
+        np.testing.assert_allclose(found, alone, rtol=1e-4, atol=1e-5)
+
+
+def test_an_image_without_colours_is_no_png(tmp_path: Path) -> None:
+    with refused("no colours, only far.T: write it as .exr"):
+        render.write_image(tmp_path / "a.png", np.zeros((2, 2, 1)), ["far.T"])
+
+
 # -- A volume alone ----------------------------------------------------------------------------------------------------
 
 

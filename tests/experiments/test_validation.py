@@ -18,6 +18,7 @@ from mivol.experiments import validation
 from mivol.experiments.validation import DIFFERS, UNTRUSTED, Validation, validate_scene
 from mivol.optim.scenes.views import derive_seed
 from mivol.scene.load import load_scene
+from mivol.validate import reference
 from mivol.validate.statistics import Significance
 from mivol.validate.trust import Doubt
 
@@ -101,6 +102,16 @@ def test_a_reference_that_cannot_be_trusted_decides_nothing(variant_rgb, scene: 
     assert verdict.code == UNTRUSTED
     assert "is no reference here, so nothing is decided" in verdict.text
     assert "Doubt: the grid is turned." in verdict.text
+
+
+@pytest.mark.parametrize(("sampler", "most", "expected"), [
+    ("independent", 33, 33), ("multijitter", 33, 25), ("stratified", 64, 64), ("orthogonal", 60, 49), ("ldsampler", 60, 16),
+    ("orthogonal", 3, 1),
+])  # fmt: skip
+def test_passes_suit_samplers_that_round_numbers_up(variant_rgb, sampler: str, most: int, expected: int) -> None:
+    """A pass has no more samples than the reference may have in all, over the number of batches."""
+    sensor = mi.load_dict({"type": "perspective", "sampler": {"type": sampler}})
+    assert reference._choose_pass_spp(sensor, 1, most * reference.MIN_BATCHES) == expected
 
 
 def test_what_cannot_be_validated_is_refused(variant_rgb, scene: Path) -> None:
