@@ -92,8 +92,9 @@ class OrientedBox:
 
 def oriented_box(shape: mi.Shape) -> OrientedBox:
     """Box around a shape."""
-    if shape.class_name() == "Cube":
-        return OrientedBox.from_box(fit_box(shape))
+    box = fit_box(shape)
+    if box is not None:
+        return OrientedBox.from_box(box)
     low, high = shape_bounds(shape)
     return OrientedBox(np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, low, high), np.eye(3))
 

@@ -336,9 +336,8 @@ def _make_boundary(shape: mi.Shape, name: str, boxes: dict[int, OrientedBox], na
     alone = not any(box.shares(boxes[shape.ptr]) for other, box in boxes.items() if other != shape.ptr)
     box = None
     if alone and shape.exterior_medium() is None and _is_bare(shape) and not shape.has_flipped_normals():
-        if shape.class_name() == "Cube":
-            box = fit_box(shape)
-        elif shape.class_name() == "Sphere" and shape.interior_medium().ptr not in named:
+        box = fit_box(shape)
+        if shape.class_name() == "Sphere" and shape.interior_medium().ptr not in named:
             # Outside of the sphere, the medium of a sensor inside it has no end until a boundary is met.
             box = fit_ball(shape)
     return Boundary(shape.interior_medium(), name, shape.class_name(), box, around=boxes[shape.ptr])

@@ -45,6 +45,62 @@ def test_box_of_a_sheared_cube():
     np.testing.assert_allclose(fit_box(cube).corners(), (ends @ shear.T)[:, :3], atol=8 * 2.0**-24 * 6)
 
 
+SHEAR = np.array([[1, 0.5, 0, 3], [0, 2, 0, -1], [0.25, 0, 1, 0], [0, 0, 0, 1.0]])
+CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+FACES = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
+         [1, 5, 7], [1, 7, 3]]  # fmt: skip
+"""Two triangles a face of the unit cube, with their outsides out."""
+
+
+def mesh_of(corners: np.ndarray, faces: list) -> mi.Mesh:
+    mesh = mi.Mesh("mesh", len(corners), len(faces))
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = mi.Float(corners.astype(np.float32).ravel())
+    params["faces"] = mi.UInt32(np.array(faces, np.uint32).ravel())
+    params.update()
+    return mesh
+
+
+@pytest.mark.parametrize("shares", [True, False], ids=["8 vertices", "36 vertices"])
+@pytest.mark.parametrize("place", [np.eye(4), SHEAR], ids=["upright", "sheared"])
+def test_a_mesh_may_be_a_box(place: np.ndarray, shares: bool) -> None:
+    """In any order of its vertices and faces; the corners are those of its vertices, to their float32."""
+    rng = np.random.default_rng(3)
+    world = CORNERS @ place[:3, :3].T + place[:3, 3]
+    order = rng.permutation(8)
+    faces = np.argsort(order)[np.array(FACES)[rng.permutation(12)]]
+    mesh = mesh_of(world[order], faces) if shares else mesh_of(world[order][faces].reshape(-1, 3), np.arange(36).reshape(12, 3))
+    found = fit_box(mesh).corners()
+    apart = np.abs(found[:, None] - world[None]).max(axis=2)
+    assert sorted(apart.argmin(axis=1)) == list(range(8))
+    assert apart.min(axis=1).max() <= 4 * 2.0**-24 * np.abs(world).max()
+
+
+MOVED = CORNERS + 1e-4 * np.eye(8)[5][:, None]
+OTHERS = {
+    "a corner that is moved": (MOVED, FACES),
+    "a frustum": (CORNERS * (1 - 0.3 * CORNERS[:, 2:] * [1, 1, 0]), FACES),
+    "faces that look inwards": (CORNERS, [face[::-1] for face in FACES]),
+    "one face that looks inwards": (CORNERS, [FACES[0][::-1], *FACES[1:]]),
+    "an open side, and one that is covered twice": (CORNERS, [*FACES[:10], [0, 1, 2], [1, 3, 2]]),
+    "triangles that overlap": (CORNERS, [[0, 1, 2], *FACES[1:]]),
+    "faces that cross the inside": (CORNERS, [[0, 1, 7], *FACES[1:]]),
+    "a tetrahedron": (CORNERS[:4], [[0, 1, 2]] * 12),
+    "a part of the sides": (CORNERS, FACES[:11]),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_meshes_are_no_box(name: str) -> None:
+    assert fit_box(mesh_of(*OTHERS[name])) is None
+
+
+def test_other_shapes_are_no_box() -> None:
+    assert fit_box(mi.load_dict({"type": "sphere"})) is None
+    mirrored = mi.ScalarTransform4f().scale([-1, 1, 1])
+    assert fit_box(mi.load_dict({"type": "cube", "to_world": mirrored})) is None  # its inside is outside, as in Mitsuba
+
+
 # -- Balls -----------------------------------------------------------------------------------------------------------------
 
 

@@ -98,11 +98,15 @@ def test_no_phase_function_and_no_light_sampling():
     assert len(kernels(peaked, depth=6).splitlines()) == len(kernels(with_phase, depth=1).splitlines())
 
 
-def test_boxes_trace_no_acceleration_structure():
-    """A box is a slab test, a ball a quadratic equation; a cylinder is traced, and so is a box with a surface beside it."""
+def test_boxes_trace_no_acceleration_structure(tmp_path):
+    """A box is a slab test, also from a file, a ball a quadratic equation; a cylinder is traced, and a box beside a surface."""
     wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -3])}
     assert traced_rays(kernels(scene_of())) == 0
     assert traced_rays(kernels(scene_of(boundary=ball_of, where=((0, 0, 0), 1.0)))) == 0
+    mi.load_dict({"type": "cube"}).write_ply(str(tmp_path / "box.ply"))
+    null = {"type": "null"}
+    file = {"type": "ply", "filename": str(tmp_path / "box.ply"), "bsdf": null}
+    assert traced_rays(kernels(scene_of(boundary=lambda interior: file | {"interior": interior}, where=()))) == 0
     tube = lambda interior: {"type": "cylinder", "bsdf": {"type": "null"}, "interior": interior}  # noqa: E731
     assert traced_rays(kernels(scene_of(boundary=tube, where=()))) == 1
     assert traced_rays(kernels(scene_of(wall=wall))) == 1

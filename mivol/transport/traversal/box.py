@@ -5,6 +5,7 @@ References: Kay & Kajiya 1986 (slab test).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -131,14 +132,54 @@ def opaque_rows(rows: np.ndarray) -> list[list[mi.Float64]]:
     return [flat[k : k + 4] for k in (0, 4, 8)]
 
 
-def fit_box(shape: mi.Shape) -> Box:
-    """Fit the box of a ``cube`` shape. The vertices are read on the host, which is not possible inside ``dr.freeze``."""
-    world = _vertices(shape)
-    unit = (_vertices(mi.load_dict({"type": "cube"})) + 1) / 2
+def fit_box(shape: mi.Shape) -> Box | None:
+    """Fit the box of a ``cube``, or of a mesh that is a box; None for another shape, or if the faces look inwards.
+
+    The vertices are read on the host, which is not possible inside ``dr.freeze``.
+    """
+    if not shape.is_mesh() or shape.face_count() != 12:
+        return None
+    world, faces = _vertices(shape), np.array(traverse(shape)["faces"]).reshape(-1, 3)
+    is_cube = shape.class_name() == "Cube"
+    unit = (_vertices(mi.load_dict({"type": "cube"})) + 1) / 2 if is_cube else _find_unit_corners(world)
+    if unit is None or not _are_faces_of_cube(unit[faces]):
+        return None
+    corners = world[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if (np.einsum("fa,fa->f", normals, corners.mean(axis=1) - corners.mean(axis=(0, 1))) <= 0).any():
+        return None
     fit, *_ = np.linalg.lstsq(np.c_[unit, np.ones(len(unit))], world, rcond=None)
     to_world = np.eye(4)
     to_world[:3] = fit.T
     return Box(to_world)
+
+
+def _find_unit_corners(world: np.ndarray) -> np.ndarray | None:
+    """The corners (0 or 1, along each edge) of the unit cube that belong to the vertices (N, 3) of a box; None for others."""
+    corners, which = np.unique(world, axis=0, return_inverse=True)
+    if len(corners) != 8:
+        return None
+    bits = np.indices((2, 2, 2)).reshape(3, 8).T
+    tolerance = 4 * 2.0**-24 * np.abs(corners).max()  # each coordinate of a vertex was rounded to float32
+    for edges in itertools.combinations(corners[1:] - corners[0], 3):
+        apart = np.abs(corners[:, None] - (corners[0] + bits @ np.array(edges))).max(axis=2)
+        nearest = apart.argmin(axis=1)
+        if apart.min(axis=1).max() <= tolerance and len(set(nearest)) == 8:
+            return bits[nearest][which.reshape(-1)].astype(float)
+    return None
+
+
+def _are_faces_of_cube(corners: np.ndarray) -> bool:
+    """Whether triangles (12, 3 corners, 3) of the unit cube cover each of its faces: two a face, with one diagonal."""
+    covered = set()
+    for triangle in corners:
+        flat = np.flatnonzero((triangle == triangle[0]).all(axis=0))
+        if len(flat) != 1:
+            return False
+        missing = np.delete(triangle.sum(axis=0) % 2, flat)  # the corner of the face that is not in the triangle
+        covered.add((flat[0], triangle[0, flat[0]], *missing))
+    opposite = {(axis, side, 1 - a, 1 - b) for axis, side, a, b in covered}
+    return len(covered) == 12 and covered == opposite and len({found[:2] for found in covered}) == 6
 
 
 def fit_ball(shape: mi.Shape) -> Box:
