@@ -177,4 +177,4 @@ class TabulatedDensity:
 
     def refresh(self) -> None:
         """Evaluate the nodes again, after the tensors were replaced."""
-        self.voxels.texture.set_tensor(self.tabulate())
+        self.voxels.replace(self.tabulate())

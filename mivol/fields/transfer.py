@@ -290,7 +290,7 @@ class Transfer:
         """
         if not is_recording():
             self._check()
-        self.voxels.texture.set_tensor(self.classify())
+        self.voxels.replace(self.classify())
 
     def _refine(self, grid: mi.TensorXf) -> tuple[list[mi.Float], tuple[int, int, int]]:
         """A grid (Z, Y, X, C) at the nodes of the refined grid: a list of channels, and the resolution (Z, Y, X)."""

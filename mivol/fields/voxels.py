@@ -230,6 +230,11 @@ class Voxels(GridValues):
         unit = np.array([[x, y, z, 1] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float64)
         return (unit @ self.to_world.T)[:, :3]
 
+    def replace(self, values: mi.TensorXf) -> None:
+        """Replace the values by others of the same shape, also in a ``tensor`` that was read before."""
+        self.texture.set_tensor(values)
+        self.texture.tensor()  # until it is read again, a tensor of before keeps its old values
+
     def refresh(self) -> None:
         """Update the texture after values were replaced.
 

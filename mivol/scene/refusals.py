@@ -140,12 +140,12 @@ def check_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> No
         return
     moved = _emitter_placements(needs)
     collides = is_scattering_visible(needs, settings) or any(m.emits for m in needs.media)
-    rgb = [m.name for m in needs.media if m.extinction == "rgb"] if collides else []
+    parts = [(facts.name, part) for facts, view in zip(needs.media, needs.views, strict=True) for part in view.parts]
+    rgb = [name for name, part in parts if not part.exact_line and part.channels == 3] if collides else []
     reasons = [
         (bool(aovs), f"aovs asks for {', '.join(aovs)}", "leave aovs out"),
         (settings.deterministic, "deterministic is set", "leave it out, for transmittance is estimated"),
-        (bool(rgb), f"a medium scatters or emits, and the extinction of {', '.join(rgb)} is rgb", "make it grey"),
-        (any(v.microflakes is not None for v in needs.views), "a medium of its scene has sggx microflakes", "take them out"),
+        (bool(rgb), f"a medium scatters or emits, and the bounded field of {', '.join(rgb)} is rgb", "make it grey"),
         (bool(moved), f"the derivative of {', '.join(moved)} was requested", "use finite differences"),
     ]
     kind = f"is a {medium.bounded}, which is bounded (a majorant is known, and no optical depth of a ray)"

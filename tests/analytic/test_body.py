@@ -98,7 +98,6 @@ def test_a_point_has_the_parts_that_are_asked_for():
     body.has_tangent = [True, True]
     np.testing.assert_allclose(values(body.jvp_extinction_at(*at)), [7] * 3, rtol=ROUNDING)
     np.testing.assert_allclose(values(body.jvp_extinction_at(*at, "sigma_s")), [4] * 3, rtol=ROUNDING)
-    np.testing.assert_allclose(values(body.jvp_part_at(body.view.parts[1], *at)), [4] * 3, rtol=ROUNDING)
     np.testing.assert_allclose(values(body.jvp_optical_depth(inside(), 3)), [7] * 3, rtol=ROUNDING)
 
 
@@ -119,7 +118,6 @@ def test_gradients_go_to_the_parts_that_are_named():
     for deposit, expected in {
         "all": (lambda b: b.vjp_extinction_at(ray, t, weight, on), [7, 7]),
         "named": (lambda b: b.vjp_extinction_at(ray, t, weight, on, "sigma_s"), [0, 7]),
-        "one": (lambda b: b.vjp_part_at(b.view.parts[1], ray, t, weight, on), [0, 7]),
         "along": (lambda b: b.vjp_optical_depth(inside(), weight), [7, 7]),
         "constants": (lambda b: b.add_to_constants(weight, on), [7, 0]),
         "a cell": (lambda b: b.add_to_grid(b.view.parts[1], mi.Vector3i(0), [(weight, [mi.Float(0.125)] * 8)], on), [0, 7]),

@@ -116,6 +116,24 @@ def test_a_ball_that_glows() -> None:
     check(tangent[..., 0], SCALE * chord * (3 - SKY) * passed, "the derivative by sigma")
 
 
+def flakes() -> dict:
+    """Microflakes with one matrix everywhere."""
+    S = mi.VolumeGrid(np.array([1, 0.3, 0.6, 0.1, 0, -0.1], np.float32).reshape(1, 1, 1, 6))
+    return {"type": "sggx", "S": {"type": "gridvolume", "grid": S, "raw": True}}
+
+
+@pytest.mark.statistical
+def test_a_ball_of_microflakes() -> None:
+    """Along y, tau has the factor sqrt(S_yy), which changes by half its inverse if all entries of S change by 1."""
+    chord, area = 2 * np.sqrt(0.8**2 - 0.5**2), np.sqrt(0.3)
+    ball = shape("cube", {**fog(radius=0.8), "phase": flakes()})
+    image, tangent, gradients = follow(scene([0, -4, 0.5], [0, 0, 0.5], fog=ball), ("sigma_t.sigma", "S.data"), spp=4 * SPP)
+    assert len(gradients) == 2
+    seen = SKY * np.exp(-1.5 * SCALE * chord * area)
+    check(image[..., 0], seen, "the radiance")
+    check(tangent[..., 0], -SCALE * chord * (area + 1.5 * 0.5 / area) * seen, "the derivative by sigma and S")
+
+
 @pytest.mark.statistical
 def test_voxels_that_mitsuba_does_not_interpolate() -> None:
     """A row of voxels with the filter nearest, along the line of sight: tau is their mean times the length of the row."""
@@ -178,23 +196,43 @@ def test_a_boundary_that_is_entered_twice() -> None:
     check(tangent[..., 0], -SCALE * 0.8 * seen, "the derivative")
 
 
+COLOUR = (0.2, 0.8, 2.0)
+
+BALLS = {
+    "in front of a floor": lambda sigma, absorption: {"sigma_t": sigma},
+    "scattering": lambda sigma, absorption: {"sigma_t": sigma, "albedo": 0.6},
+    "of microflakes": lambda sigma, absorption: {"sigma_t": sigma, "albedo": 0.6, "phase": flakes()},
+    "in a coloured fog": lambda sigma, absorption: {"sigma_a": absorption, "sigma_s": sigma},
+    "in a coloured fog that glows": lambda sigma, absorption: {"sigma_a": absorption, "sigma_s": sigma, "emission": 0.3},
+}
+
+
 @pytest.mark.slow
 @pytest.mark.statistical
-@pytest.mark.parametrize(("albedo", "depth"), [({}, 2), ({"albedo": 0.6}, 4)])
-def test_a_ball_is_a_homogeneous_sphere(albedo: dict, depth: int, whole_paths: None) -> None:
+@pytest.mark.parametrize("name", BALLS)
+def test_a_ball_is_a_homogeneous_sphere(name: str, whole_paths: None) -> None:
     """In front of a floor, whose shadow rays meet the field as camera rays do; and scattering: images and derivatives by the
-    extinction have the means of a homogeneous sphere in the ball's place, over two passes."""
+    extinction have the means of a homogeneous sphere in the ball's place, over two passes. Each channel of a coloured fog,
+    which fills the sphere, has the means of a grey fog, whose flights have no weights."""
     place = mi.ScalarTransform4f().translate([0, 1.2, 0]).rotate([1, 0, 0], 90).scale(3)
     floor = {"type": "rectangle", "to_world": place, "bsdf": {"type": "diffuse", "reflectance": 0.6}}
-    parts = {"floor": floor} if depth == 2 else {}
+    parts, depth = ({"floor": floor}, 2) if name == "in front of a floor" else ({}, 4)
     emitter = {"type": "point", "position": [0.3, -2, 0.2], "intensity": 4.0}
-    known = shape("sphere", {"type": "mivol_medium", "sigma_t": 1.5, "scale": SCALE, **albedo}, radius=0.8)
-    seen = [
-        follow(scene([0, -4, 0.4], [0, 0, 0.2], fog=ball, emitter=emitter, **parts), (key,), depth)
-        for ball, key in ((shape("cube", {**fog(radius=0.8), **albedo}), "sigma_t.sigma"), (known, "sigma_t.value.value"))
-    ]
-    for ours, truth, what in zip(*(s[:2] for s in seen), ("the radiance", "the derivative"), strict=True):
-        assert_same_mean(of_batches(ours[..., 0]), of_batches(truth[..., 0]), what=what)
+    coloured = "coloured" in name
+    coefficient = "sigma_s" if coloured else "sigma_t"
+
+    def look(boundary: dict, sigma: dict | float, absorption: dict | float, value: str) -> tuple[np.ndarray, np.ndarray]:
+        medium = {"type": "mivol_medium", "scale": SCALE, **BALLS[name](sigma, absorption)}
+        found = scene([0, -4, 0.4], [0, 0, 0.2], fog=boundary | {"interior": medium}, emitter=emitter, **parts)
+        return follow(found, (f"{coefficient}.{value}",), depth)[:2]
+
+    sphere = shape("sphere", {}, radius=0.8)
+    rgb = {"type": "rgb", "value": list(COLOUR)}
+    ours = look(sphere if coloured else shape("cube", {}), fog(radius=0.8)["sigma_t"], rgb, "sigma")
+    for channel in (0, 2) if coloured else (0,):
+        truth = look(sphere, 1.5, COLOUR[channel], "value.value")
+        for a, b, what in zip(ours, truth, ("the radiance", "the derivative"), strict=True):
+            assert_same_mean(of_batches(a[..., channel]), of_batches(b[..., channel]), what=f"{what} of channel {channel}")
 
 
 @pytest.mark.statistical
@@ -211,8 +249,8 @@ REFUSED = {
     "aovs": ({"max_depth": 1, "aovs": "tau,depth"}, {}, "aovs asks for tau, depth: leave aovs out"),
     "deterministic": ({"max_depth": 1, "deterministic": True}, {}, "deterministic is set: leave it out"),
     "scattering": ({"max_depth": 3, "deterministic": True}, {"albedo": 0.5}, "deterministic is set: leave it out"),
-    "rgb": ({"max_depth": 3}, {**fog([1.0, 0.5, 2.0]), "albedo": 0.5}, "the extinction of fog is rgb: make it grey"),
-    "emission": ({"max_depth": 1}, {**fog([1.0, 0.5, 2.0]), "emission": 0.5}, "the extinction of fog is rgb: make it grey"),
+    "rgb": ({"max_depth": 3}, {**fog([1.0, 0.5, 2.0]), "albedo": 0.5}, "the bounded field of fog is rgb: make it grey"),
+    "emission": ({"max_depth": 1}, {**fog([1.0, 0.5, 2.0]), "emission": 0.5}, "the bounded field of fog is rgb: make it grey"),
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import drjit as dr
@@ -16,6 +17,10 @@ from mivol.fields.hash_encoding import HashSizes
 from mivol.fields.hash_grid import HashField
 from mivol.fields.nerf import NerfField, NerfSizes
 from mivol.optim.photographs.sampled_problem import find_region
+from mivol.scene.needs import find_needs
+from mivol.scene.plan import make_plan
+from mivol.scene.survey import survey_scene
+from mivol.transport.path.estimators import Settings
 from mivol.validate.statistics import Moments
 from scenes import box_of, camera, medium
 
@@ -24,11 +29,15 @@ RUNS = 12
 KEY = "box.interior_medium.sigma_t."
 
 
+def hash_grid(**more: object) -> dict:
+    """An untrained hash grid."""
+    return {"type": "mivol_hash", "majorant": 8.0, "seed": 4, **SIZES, **more}
+
+
 def scene(
     max_depth: int = 2, albedo: float = 0.0, volume: dict | None = None, emission: dict | None = None, **more: object
 ) -> mi.Scene:
     """The unit cube in white light: a pixel is the transmittance of the cube, if nothing scatters."""
-    own = {"type": "mivol_hash", "majorant": 8.0, "seed": 4, **SIZES, **more}
     return mi.load_dict(
         {
             "type": "scene",
@@ -36,7 +45,8 @@ def scene(
             "sensor": camera((0.5, -2, 0.6), (0.5, 0.5, 0.5), 4, 16),
             "light": {"type": "constant"},
             "box": box_of(
-                medium("mivol_medium", volume or own, albedo) | ({"emission": emission} if emission else {}), np.eye(4)
+                medium("mivol_medium", volume or hash_grid(**more), albedo) | ({"emission": emission} if emission else {}),
+                np.eye(4),
             ),
         }
     )
@@ -202,6 +212,50 @@ def test_nodes_hold_the_values_of_the_network(variant_rgb: str) -> None:
     # Absorption is exact along fixed rays. float32 errs by 1e-7 of a difference of 4e-4, kinks of the network by less than 1 %.
     steepest, difference = differentiate(box, params, KEY + "table", 0.01)
     assert difference == pytest.approx(steepest, rel=0.01)
+
+
+SKY, LAMP = {"type": "constant"}, {"type": "point", "position": [2.0, -1.0, 2.0]}
+
+ESTIMATORS = {
+    "absorption": (SKY, {"max_depth": 1}, {}),
+    "emission": (SKY, {"max_depth": 1}, {"emission": 0.5}),
+    "single_scattering": (LAMP, {"max_depth": 2}, {}),
+    "scattering_quadrature": (LAMP, {"max_depth": 2, "deterministic": True}, {}),
+    "free_flight": (LAMP, {"max_depth": 4}, {"emission": 0.5}),
+}
+"""An emitter, settings, and what the medium has besides, by the estimator of a segment."""
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_each_estimator_has_derivatives_by_the_weights(variant_rgb: str, name: str) -> None:
+    """With ``nodes``, gradients by the tensors are those by equal voxels, handed on through the network by Dr.Jit."""
+    emitter, settings, more = ESTIMATORS[name]
+
+    def show(volume: dict) -> mi.Scene:
+        parts = {"sensor": camera((0.5, -2, 0.6), (0.5, 0.5, 0.5), 4, 16), "light": emitter}
+        box = box_of(medium("mivol_medium", volume, 0.6, **more), np.eye(4))
+        return mi.load_dict({"type": "scene", "integrator": {"type": "mivol", **settings}, **parts, "box": box})
+
+    def differentiate(params: mi.SceneParameters, names: list[str], loss: Callable[[], mi.TensorXf]) -> list[np.ndarray]:
+        for key in names:
+            params[key] = mi.TensorXf(dr.detach(params[key]))
+            dr.enable_grad(params[key])
+        params.update()
+        dr.backward(dr.sum(loss(), axis=None))
+        return [np.array(dr.grad(params[key])) for key in names]
+
+    box, names, data = show(hash_grid(nodes=5)), [KEY + n for n in ("table", "weights_0", "weights_1")], KEY + "data"
+    params = with_values(box)
+    voxels = show({"type": "mivol_voxels", "data": mi.TensorXf(np.array(params[data]))})
+    assert make_plan(find_needs(voxels, voxels.sensors()[0], survey_scene(voxels)), Settings(**settings)).segment == name
+    found = differentiate(params, names, lambda: mi.render(box, params, spp=4, seed=1))
+    own = mi.traverse(voxels)
+    (by_voxels,) = differentiate(own, [data], lambda: mi.render(voxels, own, spp=4, seed=1))
+    expected = differentiate(params, names, lambda: params[data] * mi.TensorXf(by_voxels))
+    for ours, theirs in zip(found, expected, strict=True):
+        # The same products in another order of float32 sums.
+        np.testing.assert_allclose(ours, theirs, atol=1e-5 * np.abs(theirs).max())
+        assert theirs.any()
 
 
 @pytest.mark.parametrize("kind", ["hash", "nerf"])

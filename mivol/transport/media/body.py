@@ -192,7 +192,8 @@ class Body:
         if self.microflakes_tangent is None:
             return rows
         turned = self._jvp_microflakes(interval.ray.d)
-        return [r + t * turned for r, t in zip(rows, self.optical_depth(interval, channels), strict=True)]
+        depths = self.optical_depth(interval, channels, self.exact_parts)
+        return [r + t * turned for r, t in zip(rows, depths, strict=True)]
 
     def vjp_optical_depth(self, interval: RayInterval, weight: Weight) -> None:
         """Add ``weight`` (d loss / d tau of each channel) times this interval to the gradients of the exact parts.
@@ -200,7 +201,7 @@ class Body:
         A weight that depends on the cell is for media of grids that share their cells, without followed microflakes.
         """
         if self.microflakes_gradient is not None:
-            amount = self.optical_depth(interval, len(weight))
+            amount = self.optical_depth(interval, len(weight), self.exact_parts)
             self._vjp_microflakes(interval.ray.d, weight, amount, interval.active)
         area = self.area(interval.ray.d)
         for part, gradient in self._parts_with_gradients():
@@ -210,13 +211,6 @@ class Body:
                     _map_weight(weight, lambda rows, n=part.channels: to_part_channels([area * w for w in rows], n)),
                     interval,
                 )
-
-    def jvp_part_at(self, part: Extinction, ray: Ray, t: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
-        """Tangent of the coefficient [1/length] of a part at a point of a ray."""
-        for other, change in self._parts_with_tangents():
-            if other is part:
-                return to_scene_channels(part.jvp_at(change, ray, t, active), channels)
-        return [mi.Float(0) for _ in range(channels)]
 
     def _parts_with_tangents(self) -> list[tuple[Extinction, Any]]:
         """The parts with a tangent, and their tangents. Other parts are not walked: their derivative is 0."""
@@ -230,11 +224,6 @@ class Body:
             for part, gradient, follows in zip(self.view.parts, self.gradients, self.follows, strict=True)
             if follows
         ]
-
-    def vjp_part_at(self, part: Extinction, ray: Ray, t: mi.Float, weight: list[mi.Float], active: mi.Bool) -> None:
-        """Add ``weight`` (d loss / d coefficient of each channel) at a point: the transpose of :meth:`jvp_part_at`."""
-        gradient = next(g for p, g in zip(self.view.parts, self.gradients, strict=True) if p is part)
-        part.vjp_at(gradient, to_part_channels(weight, part.channels), ray, t, active)
 
     def extinction_at(self, ray: Ray, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
         """Coefficient [1/length] of each channel at a point of a ray: of all parts, or of the parts whose name starts with

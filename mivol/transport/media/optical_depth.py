@@ -76,11 +76,15 @@ def integrate_optical_depth(
     return end, tau, passages
 
 
-def segment_optical_depth(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> list[mi.Float]:
-    """Integrate the optical depth [1] of each channel over a segment of known length."""
+def segment_optical_depth(media: SceneMedia, segment: RaySegment, active: mi.Bool, exact_only: bool = False) -> list[mi.Float]:
+    """Integrate the optical depth [1] of each channel over a segment of known length.
+
+    With ``exact_only``, parts without a known integral along a ray are left out; otherwise they raise.
+    """
 
     def add(tau: list[mi.Float], interval: MediumInterval) -> list[mi.Float]:
-        own = interval.body.optical_depth(interval, media.channels)
+        body = interval.body
+        own = body.optical_depth(interval, media.channels, body.exact_parts if exact_only else None)
         return [t + d for t, d in zip(tau, own, strict=True)]
 
     return revisit_media(media, segment, add, [mi.Float(0) for _ in range(media.channels)], active, anywhere=True)
@@ -125,7 +129,7 @@ def vjp_rows(
         # After the walk: Dr.Jit loses what is differentiated in a loop with respect to an array that already has a gradient.
         rows = weight(body) if callable(weight) else weight
         on, each = active & (point.total > 0), [w * point.total for w in rows]
-        body.vjp_part_at(part, segment.ray, point.t, each, on)
+        body.vjp_extinction_at(segment.ray, point.t, each, on, part.name)
 
 
 def jvp_optical_depth(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> mi.Spectrum:
@@ -147,7 +151,7 @@ def jvp_rows(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> list[mi
     tau, points = revisit_media(media, segment, visit, start, active, anywhere=True)
     for (body, part), point in zip(bounded, points, strict=True):
         on = active & (point.total > 0)
-        rows = body.jvp_part_at(part, segment.ray, point.t, media.channels, on)
+        rows = body.jvp_extinction_at(segment.ray, point.t, media.channels, on, part.name)
         tau = [t + dr.select(on, point.total * row, 0) for t, row in zip(tau, rows, strict=True)]
     return tau
 

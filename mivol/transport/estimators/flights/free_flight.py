@@ -338,8 +338,8 @@ class FreeFlight:
         """
         if self.media.channels == 1:
             return mi.Spectrum(1)
-        tau = segment_optical_depth(self.media, passed, active)
-        # Only ratios of transmittances matter; the largest becomes 1.
+        # Only ratios of transmittances matter; the largest becomes 1. Bounded parts are grey, and cancel.
+        tau = segment_optical_depth(self.media, passed, active, exact_only=True)
         least = minimum(tau)
         value = to_spectrum([dr.exp(least - row) for row in tau])
         hits = [] if collision is None else self.media.bodies_at(collision.body, collision.on)
