@@ -82,47 +82,35 @@ Found = Iterator[tuple[str, bool]]
 def _not_finite(b: MediumShape) -> Found:
     if not np.isfinite(b.majorant) or b.majorant < 0:
         yield (
-            (
-                f"the extinction inside {b.name} has {b.majorant} as its largest value; its voxels must be finite and not negative."
-            ),
-            True,
-        )
+            f"the extinction inside {b.name} has {b.majorant} as its largest value; its voxels must be finite and not negative."
+        ), True
 
 
 def _rotated(b: MediumShape) -> Found:
     linear = [np.abs(to_local[:3, :3]) for to_local in b.grids if b.overhang(to_local)]
     if any(np.any(np.sort(m, axis=1)[:, :2] > 1e-5 * m.max(axis=1, keepdims=True)) for m in linear):
         yield (
-            (
-                f"the grid inside {b.name} is rotated or sheared and {b.name} is larger than the grid's own box: Mitsuba fills the "
-                "grid's upright bounding box with clamped values; make the boundary the grid's own box."
-            ),
-            True,
-        )
+            f"the grid inside {b.name} is rotated or sheared and {b.name} is larger than the grid's own box: Mitsuba fills the "
+            "grid's upright bounding box with clamped values; make the boundary the grid's own box."
+        ), True
 
 
 def _too_deep(b: MediumShape) -> Found:
     depth = b.majorant * b.diagonal
     if b.overhangs and depth > MAX_OPTICAL_DEPTH:
         yield (
-            (
-                f"{b.name} is larger than the box of its grid, and the largest extinction times its diagonal is {depth:.3g}, above "
-                f"{MAX_OPTICAL_DEPTH:g}: Mitsuba shows 0 where a ray misses the grid (issue 336); make the boundary the grid's own "
-                "box."
-            ),
-            True,
-        )
+            f"{b.name} is larger than the box of its grid, and the largest extinction times its diagonal is {depth:.3g}, above "
+            f"{MAX_OPTICAL_DEPTH:g}: Mitsuba shows 0 where a ray misses the grid (issue 336); make the boundary the grid's own "
+            "box."
+        ), True
 
 
 def _constant_box(b: MediumShape) -> Found:
     if b.volume == "ConstVolume" and b.overhangs:
         yield (
-            (
-                f"the heterogeneous medium inside {b.name} has a constant extinction, which Mitsuba puts into the unit cube of the "
-                f"constvolume only, not into all of {b.name}; use the medium homogeneous if all of it was meant."
-            ),
-            False,
-        )
+            f"the heterogeneous medium inside {b.name} has a constant extinction, which Mitsuba puts into the unit cube of the "
+            f"constvolume only, not into all of {b.name}; use the medium homogeneous if all of it was meant."
+        ), False
 
 
 def _mirrored(b: MediumShape) -> Found:
@@ -132,12 +120,9 @@ def _mirrored(b: MediumShape) -> Found:
         turned = np.einsum("ij,ij->", p, np.cross(q, r)) < 0
     if turned:
         yield (
-            (
-                f"the normals of {b.name} point inwards (a mirroring to_world?), so that Mitsuba has the medium outside; "
-                "mirror the grid, not the shape."
-            ),
-            True,
-        )
+            f"the normals of {b.name} point inwards (a mirroring to_world?), so that Mitsuba has the medium outside; "
+            "mirror the grid, not the shape."
+        ), True
 
 
 def _wrong_inverse(b: MediumShape) -> Found:
@@ -147,35 +132,26 @@ def _wrong_inverse(b: MediumShape) -> Found:
     product = b.to_local @ b.to_local_inverse.T
     if np.abs(product - np.eye(4)).max() > 1e-4 * max(1.0, np.abs(b.to_local).max() * np.abs(b.to_local_inverse).max()):
         yield (
-            (
-                f"the transform of the volume inside {b.name} and Mitsuba's inverse of it do not match (a rotation axis of length "
-                "other than 1?); normalise the axis."
-            ),
-            True,
-        )
+            f"the transform of the volume inside {b.name} and Mitsuba's inverse of it do not match (a rotation axis of length "
+            "other than 1?); normalise the axis."
+        ), True
 
 
 def _small_g(b: MediumShape) -> Found:
     g = first_number(b.params.get("phase_function.g", 0.0))
     if 0 < abs(g) < MIN_G and not _is_black(b):
         yield (
-            (
-                f"the phase function inside {b.name} is hg with g = {g:.2g}: the mean cosine of Mitsuba's samples is off by about "
-                "3e-8/g; use the isotropic phase function."
-            ),
-            False,
-        )
+            f"the phase function inside {b.name} is hg with g = {g:.2g}: the mean cosine of Mitsuba's samples is off by about "
+            "3e-8/g; use the isotropic phase function."
+        ), False
 
 
 def _microflakes(b: MediumShape) -> Found:
     if any(re.search(r"^phase_function.*\bS\.", key) for key in b.params) and not _is_black(b):
         yield (
-            (
-                f"the phase function inside {b.name} has microflakes (sggx), and Mitsuba draws their directions from another "
-                "density than it divides by; light them by emitters of one position or direction, or use another phase function."
-            ),
-            True,
-        )
+            f"the phase function inside {b.name} has microflakes (sggx), and Mitsuba draws their directions from another "
+            "density than it divides by; light them by emitters of one position or direction, or use another phase function."
+        ), True
 
 
 def _is_black(b: MediumShape) -> bool:
@@ -192,13 +168,10 @@ def _emission(b: MediumShape) -> Found:
 def _thick_skin(b: MediumShape) -> Found:
     if b.skin > MIN_SKIN_LOSS and not _is_black(b):
         yield (
-            (
-                f"the medium inside {b.name} is dense where it touches it: Mitsuba starts rays a little behind the surface where "
-                f"they enter, and loses about {b.skin:.1%} of the light that comes back head-on, more aslant; leave the outermost "
-                "voxels empty, or allow for that much."
-            ),
-            False,
-        )
+            f"the medium inside {b.name} is dense where it touches it: Mitsuba starts rays a little behind the surface where "
+            f"they enter, and loses about {b.skin:.1%} of the light that comes back head-on, more aslant; leave the outermost "
+            "voxels empty, or allow for that much."
+        ), False
 
 
 DOUBT_CHECKS: dict[str, Callable[[MediumShape], Found]] = {
