@@ -15,7 +15,6 @@ from mivol.optim.strategy import setting, union_type
 from mivol.scene.sensors import Hemisphere, LookAts, Ring, SceneSensors
 from mivol.schema import (
     AUTO,
-    INFINITY,
     Depth,
     HeldOut,
     Output,
@@ -76,7 +75,9 @@ class Sought(Section):
 
     key: Annotated[str, setting("1", "key of mi.traverse(scene)", min_length=1)]
     unit: Annotated[str, setting("1", "unit of the value; empty: the usual unit of the key")] = ""
-    domain: Annotated[tuple[float, float], setting("unit", "smallest and largest value")] = (0.0, INFINITY)
+    domain: Annotated[
+        tuple[float, float] | None, setting("unit", "smallest and largest value; absent: those that make sense for the key")
+    ] = None
     map: Annotated[str, setting("1", "map from the optimizer's numbers: key of MAPS")] = "identity"
     lr: Annotated[float, setting("unit", "learning rate: typical change per step", gt=0)] = 0.1
     start: Annotated[

@@ -123,7 +123,7 @@ def make_start(settings: Sought, base: Path, scene: mi.Scene) -> Start:
         check_grid(settings.key, shape, "give parameter.shape fewer voxels")
         value = np.full(shape, check_start(settings, shape), dtype=np.float32)
     extent = box_edges(grid_to_world(settings.key, scene))[::-1] if value.ndim >= GRID else (1.0, 1.0, 1.0)
-    parameter = Parameter(settings.key, find_unit(settings), settings.domain, settings.map, settings.lr, extent, settings.prior)
+    parameter = Parameter(settings.key, settings.unit, settings.domain, settings.map, settings.lr, extent, settings.prior)
     parameter.to_reals(mi.TensorXf(np.ascontiguousarray(value)))
     return Start(parameter, value)
 
@@ -148,29 +148,6 @@ def grid_to_world(key: str, scene: mi.Scene) -> np.ndarray:
 def box_edges(place: np.ndarray) -> tuple[float, float, float]:
     """Lengths (x, y, z) of the edges of a grid's box."""
     return tuple(float(edge) for edge in np.linalg.norm(place[:3, :3], axis=0))
-
-
-UNITS = {
-    "sigma_t": "1/length",
-    "sigma_a": "1/length",
-    "sigma_s": "1/length",
-    "albedo": "1",
-    "g": "1",
-    "position": "length",
-    "radiance": "radiance",
-    "irradiance": "radiance sr",
-    "intensity": "radiance length²",
-    "reflectance": "1",
-    "alpha": "1",
-    "scale": "1",
-}
-"""Units by a word of the key. Mitsuba's extinction is ``scale`` times ``sigma_t``, its sky ``scale`` times ``data``: only one
-factor has the unit."""
-
-
-def find_unit(settings: Sought) -> str:
-    """Unit of a parameter: the unit in the settings, else the unit of the last word of the key with an entry, else ""."""
-    return settings.unit or next((UNITS[word] for word in reversed(settings.key.split(".")) if word in UNITS), "")
 
 
 # -- Emissive starts -------------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -110,14 +111,50 @@ MAPS: dict[str, Map] = {
 }
 
 
+class Quantity(NamedTuple):
+    """What a parameter is: the unit of its values, and the closed domain (low, high) that makes sense of them."""
+
+    unit: str
+    domain: tuple[float, float]
+
+
+NOT_NEGATIVE, SHARE, ANY = (0.0, math.inf), (0.0, 1.0), (-math.inf, math.inf)
+
+QUANTITIES = {
+    "sigma_t": Quantity("1/length", NOT_NEGATIVE),
+    "sigma_a": Quantity("1/length", NOT_NEGATIVE),
+    "sigma_s": Quantity("1/length", NOT_NEGATIVE),
+    "g": Quantity("1", (-0.999, 0.999)),  # at -1 and 1 a phase function is a delta function
+    "position": Quantity("length", ANY),
+    "radiance": Quantity("radiance", NOT_NEGATIVE),
+    "irradiance": Quantity("radiance sr", NOT_NEGATIVE),
+    "intensity": Quantity("radiance length²", NOT_NEGATIVE),
+    "scale": Quantity("1", NOT_NEGATIVE),
+    "data": Quantity("", NOT_NEGATIVE),
+    **dict.fromkeys(("albedo", "reflectance", "alpha", "base_color", "roughness", "metallic"), Quantity("1", SHARE)),
+    **dict.fromkeys(("diffuse_reflectance", "specular_reflectance", "specular_transmittance"), Quantity("1", SHARE)),
+}
+"""Quantities by the last word of a key. Mitsuba's extinction is ``scale`` times ``sigma_t``, its sky ``scale`` times ``data``:
+only one factor has the unit."""
+
+
+def find_quantity(key: str) -> Quantity:
+    """The quantity of a key: of its last word, or of the word before ``data`` and ``value``; else any number without a unit."""
+    words = key.split(".")
+    while len(words) > 1 and words[-1] in ("data", "value") and words[-2] in {*QUANTITIES, "value"}:
+        words.pop()
+    return QUANTITIES.get(words[-1], Quantity("", ANY))
+
+
 @dataclass(frozen=True)
 class Parameter:
     """A scene parameter to fit.
 
     Attributes:
         name: key of ``mi.traverse(scene)``.
-        unit: unit of the value, for labels.
-        domain: (low, high), closed; ends may be infinite.
+        unit: unit of the value, for labels; by default the usual unit of the key.
+        domain: (low, high), closed; ends may be infinite. By default the domain that makes sense for the key: an extinction is
+            not negative, an albedo is at most 1.
         map: key of MAPS.
         lr: step of Adam, in the map's reals (identity: the parameter's own unit).
         extent: edges (z, y, x) of a grid's box [length], for the voxel size in priors.
@@ -125,14 +162,17 @@ class Parameter:
     """
 
     name: str
-    unit: str = "1"
-    domain: tuple[float, float] = (-math.inf, math.inf)
+    unit: str = ""
+    domain: tuple[float, float] | None = None
     map: str = "identity"
     lr: float = 0.01
     extent: tuple[float, float, float] = (1.0, 1.0, 1.0)
     priors: tuple[Prior, ...] = ()
 
     def __post_init__(self) -> None:
+        usual = find_quantity(self.name)
+        object.__setattr__(self, "unit", self.unit or usual.unit)
+        object.__setattr__(self, "domain", usual.domain if self.domain is None else self.domain)
         low, high = self.domain
         if not low < high:
             raise MivolError(f"{self.name}: domain [{low}, {high}] is empty: give the smaller bound first.")

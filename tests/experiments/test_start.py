@@ -11,10 +11,9 @@ import pytest
 from fit_scene import KEY, absorbing_scene, camera, frontal, views_of_truth
 from tiny_experiment import FIT, SCENE, TRUTH, files_of, refused, run
 
-from mivol.config import Sought
 from mivol.errors import MivolError
 from mivol.experiments import start
-from mivol.experiments.start import FACTORS, LEAST, PARTS, average_density, find_emissive_start, find_unit, to_photographs
+from mivol.experiments.start import FACTORS, LEAST, PARTS, average_density, find_emissive_start, to_photographs
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_volume
 from mivol.optim.first_order import Adam
@@ -54,27 +53,6 @@ def test_the_fit_does_not_start_at_the_truth(variant_rgb, folder: Path) -> None:
 
 
 ALBEDO = "cube.interior_medium.albedo.value.value"
-
-
-@pytest.mark.parametrize(
-    ("key", "unit"),
-    [
-        ("lamp.position", "length"),
-        ("smoke.interior_medium.sigma_t.data", "1/length"),
-        (ALBEDO, "1"),
-        ("cube.interior_medium.phase_function.g", "1"),
-        ("sky.radiance.value", "radiance"),
-        ("sun.irradiance.value", "radiance sr"),
-        ("lamp.intensity.value", "radiance length²"),
-        ("wall.bsdf.reflectance.data", "1"),
-        ("albedo.position", "length"),
-        ("cube.to_world", ""),
-    ],
-)
-def test_a_key_tells_its_unit(key: str, unit: str) -> None:
-    """By its last word that has one; what the experiment says goes before."""
-    assert find_unit(Sought(key=key)) == unit
-    assert find_unit(Sought(key=key, unit="1/m")) == "1/m"
 
 
 def test_numbers_of_a_fit_are_recorded_with_their_units(variant_rgb, folder: Path) -> None:

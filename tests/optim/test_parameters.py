@@ -11,7 +11,19 @@ import pytest
 from fit_scene import KEY, absorbing_scene
 
 from mivol.errors import MivolError
-from mivol.optim.parameters import MAPS, Parameter, as_tensor, find, inverse_softplus, like, softplus
+from mivol.optim.parameters import (
+    ANY,
+    MAPS,
+    NOT_NEGATIVE,
+    SHARE,
+    Parameter,
+    as_tensor,
+    find,
+    find_quantity,
+    inverse_softplus,
+    like,
+    softplus,
+)
 
 EPS = float(np.finfo(np.float32).eps)
 DOMAINS = {"identity": (0.0, math.inf), "softplus": (0.0, math.inf), "log": (0.0, math.inf), "logistic": (0.0, 1.0)}
@@ -107,3 +119,29 @@ def test_an_object_without_an_id_is_asked_for_one(variant_rgb) -> None:
     for key in (next(key for key in list(nameless.keys()) if key.startswith("object_")), "object_123.emitter.radiance.value"):
         with pytest.raises(MivolError, match="memory address"):
             find(key, nameless)
+
+
+@pytest.mark.parametrize(
+    ("key", "unit", "domain"),
+    [
+        ("lamp.position", "length", ANY),
+        ("smoke.interior_medium.sigma_t.data", "1/length", NOT_NEGATIVE),
+        ("smoke.interior_medium.albedo.value.value", "1", SHARE),
+        ("smoke.interior_medium.sigma_t.weights_0", "", ANY),
+        ("cube.interior_medium.phase_function.g", "1", (-0.999, 0.999)),
+        ("sky.radiance.value", "radiance", NOT_NEGATIVE),
+        ("sun.irradiance.value", "radiance sr", NOT_NEGATIVE),
+        ("lamp.intensity.value", "radiance length²", NOT_NEGATIVE),
+        ("wall.bsdf.reflectance.data", "1", SHARE),
+        ("ball.bsdf.diffuse_reflectance.value", "1", SHARE),
+        ("sky.data", "", NOT_NEGATIVE),
+        ("albedo.position", "length", ANY),
+        ("cube.to_world", "", ANY),
+    ],
+)
+def test_a_key_tells_its_unit_and_domain(key: str, unit: str, domain: tuple[float, float]) -> None:
+    """By its last word that says something; what is given goes before."""
+    assert find_quantity(key) == (unit, domain)
+    assert (Parameter(key).unit, Parameter(key).domain) == (unit, domain)
+    given = Parameter(key, "1/m", (-2.0, 3.0))
+    assert (given.unit, given.domain) == ("1/m", (-2.0, 3.0))
