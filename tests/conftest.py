@@ -131,9 +131,9 @@ def record(request: pytest.FixtureRequest) -> bool:
     return request.config.getoption("--record")
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def variant_rgb(request: pytest.FixtureRequest) -> str:
-    """An rgb variant with derivatives is active; its name."""
+    """An rgb variant with derivatives is active in each test that asks for no other; its name."""
     name = request.config.getoption("--variant")
     mi.set_variant(name)
     return name

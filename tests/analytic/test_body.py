@@ -19,8 +19,6 @@ from mivol.transport.traversal.box import Box
 from mivol.transport.traversal.lattice import Lattice
 from scenes import as_float32, centred, grid_volume
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 UNIT = Box(np.eye(4))
 ON = True
 ROUNDING = 8 * 2.0**-23

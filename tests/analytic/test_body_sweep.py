@@ -15,8 +15,6 @@ from mivol.transport.media.ray_intervals import MediumInterval, RaySegment
 from mivol.transport.media.scene_media import SceneMedia
 from scenes import box_of, camera, centred, grid_volume, media_of
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 N = 5
 SIGMA = np.array([0.5, 2.0, 0.25, 1.0, 4.0], np.float32)
 """Voxels of a unit cube along x, in a constant of 0.5 that fills [-1, 2]^3."""

@@ -12,8 +12,6 @@ import pytest
 from mivol.transport.traversal.box import Box, clip_to_ball, fit_ball, fit_box, is_in_box
 from scenes import camera
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def placed(low: float, edge: float) -> np.ndarray:
     """A cube with its low corner on the diagonal."""

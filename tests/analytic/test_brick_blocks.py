@@ -11,8 +11,6 @@ from scattering_scenes import cases
 from mivol.transport.traversal import grid_blocks
 from mivol.transport.traversal.lattice import Lattice
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 @pytest.mark.parametrize("name", cases(TWINS, slow=("one brick", "part of a brick", "bricks", "every cell walked")))
 def test_blocks_of_a_sparse_grid(name: str) -> None:

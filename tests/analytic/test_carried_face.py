@@ -14,8 +14,6 @@ from mivol.transport.line_integrals.radiance_field import RayGradient, find_occu
 from mivol.transport.line_integrals.radiance_source import Exact, make_exact
 from mivol.transport.traversal.occupied_cells import OccupiedCells
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def followed(field: SphericalGrid, cells: OccupiedCells, o, d) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Values of rays through the given cells, and the derivatives of a weighted sum."""

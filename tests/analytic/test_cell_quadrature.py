@@ -9,8 +9,6 @@ import pytest
 from mivol.transport.traversal.cell_quadrature import share_opacity, weigh_emission_density
 from mivol.transport.traversal.interpolation import GAUSS_POINT
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 DT = 0.7
 SIGMAS = np.array([0.0, 1e-6, 0.1, 1.0, 30.0, 1e5])
 MOMENTS = 2e-5

@@ -15,8 +15,6 @@ from mivol.transport.media.compositing import (
     transmittance_of,
 )
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 PIECES = [(0.5, 2.0), (1.5, 0.25), (0.1, 4.0)]
 """Optical depth and colour of three pieces, the nearest first."""
 

@@ -5,11 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import pytest
 
 from mivol.transport.estimators.scores import TrackedFactor, TrackedTerm
-
-pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 ON = (True, False, True)
 

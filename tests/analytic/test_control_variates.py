@@ -31,8 +31,6 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import Settings
 from scenes import as_float32, box_of, camera, grid_volume, media_of, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 ALBEDO = 0.7
 
 

@@ -18,8 +18,6 @@ from mivol.transport.estimators.lighting.vertex import MediumVertex, SurfaceVert
 from mivol.transport.media.body import medium_interaction
 from scenes import box_of, camera, centred, media_of, medium, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 ROUNDING = 16 * 2.0**-23
 POWER, FAR, DEPTH = 3.0, 4.0, 0.5
 KEY = "fog.interior_medium.sigma_t.value.value"

@@ -29,8 +29,6 @@ from mivol.transport.path.estimators import Settings
 from mivol.transport.traversal.random_numbers import seed_pcg32
 from scenes import as_float32, box_of, grid_volume, media_of, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 @pytest.mark.parametrize("ends", [(0.5, 2.0), (2.0, 0.5), (0.5, 200.0), (1e-3, 0.02)])
 def test_collisions_in_a_cell_of_linear_extinction(ends):

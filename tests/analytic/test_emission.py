@@ -20,7 +20,7 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.cell_quadrature import share_opacity, weigh_emission_density
 from scenes import as_float32, ball_of, box_of, camera, centred, media_of
 
-pytestmark = pytest.mark.usefixtures("variant_rgb", "traced_balls")
+pytestmark = pytest.mark.usefixtures("traced_balls")
 
 EPS = 2.0**-23
 

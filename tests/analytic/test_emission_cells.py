@@ -11,8 +11,6 @@ from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.lattice import Lattice
 from scenes import FRAMES
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def shift_along_x(x: float) -> np.ndarray:
     to_world = np.eye(4)

@@ -23,8 +23,6 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.validate.statistics import Moments
 from scenes import affine, box_of, grid_volume, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 N = 1 << 14
 
 

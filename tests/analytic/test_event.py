@@ -24,8 +24,6 @@ from mivol.transport.traversal.rays import point_along
 from mivol.validate.statistics import Moments
 from scenes import box_of, camera, centred, media_of, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 WALL = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.5}}
 
 

@@ -17,8 +17,6 @@ from mivol.points.gaussians import Gaussians
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 RAYS, SCALE = 64, 1.5
 
 ROUNDING = 2e-5

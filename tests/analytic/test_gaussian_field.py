@@ -14,8 +14,6 @@ from mivol.fields import gaussian_field
 from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, MIN_RELATIVE_SCALE, CellLists, GaussianField, list_gaussians
 from mivol.fields.gaussian_line import ROW_SIZE, SCALE_COLUMN
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def rows_of(field: GaussianField, scale: float = 1.0) -> np.ndarray:
     return np.array(field.rows(mi.Float(scale)), np.float64).reshape(-1, ROW_SIZE)

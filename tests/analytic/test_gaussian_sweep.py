@@ -20,8 +20,6 @@ from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.gaussian_sweep import SLOTS, GaussianSweep, visit_far_to_near
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 RAYS, ROUNDING = 64, 1e-4
 """ROUNDING as in tests/conformance/test_gaussian_radiance.py."""
 

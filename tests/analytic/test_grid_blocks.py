@@ -22,8 +22,6 @@ from mivol.transport.traversal.grid_walk import walk_cells
 from mivol.transport.traversal.lattice import clip_to_grid
 from scenes import FRAMES, as_float32, centred, make_lattice, random_rays, tensor, to_lanes
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def shell(n):
     """A shell of radius 0.35, a voxel thick, in an otherwise empty grid."""

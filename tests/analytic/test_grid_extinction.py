@@ -18,8 +18,6 @@ from mivol.transport.media.grid_extinction import (
 )
 from mivol.transport.traversal.lattice import Lattice
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 PLANE = np.arange(8.0).reshape(2, 2, 2)
 """x + 2 y + 4 z in the voxels of the unit cube, whose centres lie at 0.25 and 0.75."""
 

@@ -16,8 +16,6 @@ from mivol.transport.media.grid_extinction import GridExtinction
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.lattice import Lattice
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 ASKING = SimpleNamespace(request="somebody asks", alternative="do without")
 
 

@@ -17,8 +17,6 @@ from mivol.transport.traversal.interpolation import (
 )
 from scenes import as_float32
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 BITS = np.array([[q & 1, q >> 1 & 1, q >> 2] for q in range(8)])
 ROUNDING = 2.0**-24
 

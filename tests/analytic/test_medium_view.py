@@ -17,8 +17,6 @@ from mivol.transport.traversal.box import Box
 from mivol.transport.traversal.lattice import Lattice
 from scenes import centred, grid_volume, medium, refused
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def grid(channels: int = 1) -> GridExtinction:
     return GridExtinction("sigma_s", Lattice(mi.TensorXf(np.zeros((2, 2, 2, channels), np.float32)), np.eye(4)))

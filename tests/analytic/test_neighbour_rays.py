@@ -25,8 +25,6 @@ from mivol.transport.line_integrals.radiance_source import Baked, bake, make_exa
 from mivol.transport.traversal import occupied_cells
 from mivol.transport.traversal.occupied_cells import FEWEST_RAYS, RayOrder
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 COUNT = 700
 HALF = np.array([[0.5, 0, 0, 0.25], [0, 0.5, 0, 0.25], [0, 0, 0.5, 0.25], [0, 0, 0, 1]])
 """The unit cube to half of it about its middle."""

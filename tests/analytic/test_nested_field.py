@@ -15,8 +15,6 @@ from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
 from mivol.transport.line_integrals.radiance_field import RayGradient, find_occupied_cells, make_model, render_rays, vjp_rays
 from mivol.transport.line_integrals.radiance_source import bake, make_exact, vjp_bake
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 LEVELS = 3
 
 

@@ -12,8 +12,6 @@ from scipy.special import hyp1f1
 
 from mivol.numerics import exp_moments, fast_max, fast_min, maximum, minimum, one_minus_exp, phi1
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 MOMENT_BOUNDS = (4e-7, 4e-7, 8e-7, 2e-6, 6e-6, 2e-5)
 
 

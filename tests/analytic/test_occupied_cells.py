@@ -18,8 +18,6 @@ from mivol.transport.traversal.lattice import clip_to_grid
 from mivol.transport.traversal.occupied_cells import CellIndex
 from mivol.transport.traversal.occupied_walk import walk_occupied_cells
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def test_fractions_across_a_ray_along_an_axis_are_those_of_its_start():
     """Equal to the bit: fractions are not reversed along the ray, since 1 - (1 - frac) would round them."""

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
-import pytest
 from radiance_rays import CUBE
 
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import find_occupied_cells
 from mivol.transport.traversal.occupied_cells import _numbered
 from mivol.transport.traversal.occupied_walk import count_pieces, find_piece
-
-pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
 def test_pieces_of_a_ray_through_the_middle_and_of_one_that_misses() -> None:

@@ -37,8 +37,6 @@ from mivol.phase.closed_forms import (
 from mivol.phase.measured import ALIASES, NAMES, named_medium
 from mivol.phase.table import Lookup, Table
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def test_moments_of_rayleigh_and_draine():
     assert np.max(np.abs(integrals(eval_rayleigh) - [1, 0, 0.4, 0])) <= 4 * EPS

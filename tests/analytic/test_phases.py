@@ -11,8 +11,6 @@ from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.scene_media import SceneMedia
 from scenes import box_of, camera, centred, media_of, medium, refused, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 LOBES = {
     "even": {"type": "isotropic"},
     "forward": {"type": "hg", "g": 0.5},

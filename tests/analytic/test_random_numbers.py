@@ -13,8 +13,6 @@ from false_alarms import assert_same_mean, fresh
 from mivol.transport.traversal.random_numbers import SpreadSampler, draw_pcg32, seed_pcg32
 from mivol.validate.statistics import Moments
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def start(number: float) -> mi.Float:
     """A seed in [0, 1) for generators, different in each round of seeds."""

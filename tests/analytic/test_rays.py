@@ -11,7 +11,7 @@ from scattering_scenes import assert_same_images, fog, mivol, point, smoke
 from mivol.transport.traversal.rays import FineRay, point_along, to_mitsuba_ray
 from scenes import ball_of, camera, medium, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb", "traced_balls")
+pytestmark = pytest.mark.usefixtures("traced_balls")
 
 PLACE = np.array([100.0 + 1e-9, -8.0 + 1e-10, 1e-12])
 """Its distance from the nearest float32 numbers is far below their steps there."""

@@ -28,8 +28,6 @@ from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridE
 from mivol.transport.traversal.random_numbers import seed_pcg32
 from scenes import as_float32, make_lattice, to_lanes
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 N, SCALE = 96, 1.5
 ROUNDING = 4 * 2.0**-23
 

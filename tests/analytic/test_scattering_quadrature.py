@@ -19,8 +19,6 @@ from scattering_scenes import PLACE, aimed, close_up, fog, mivol, pencils, point
 from mivol.transport.estimators.single_scattering import scattering_quadrature as quadrature
 from scenes import as_float32, box_of, centred, grid_volume, refused, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 EMITTERS = {
     "point outside": lambda: [point([1.5, 1, 2.0])],
     "point inside": lambda: [point([0.3, -0.2, 0.35])],

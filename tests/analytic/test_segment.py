@@ -11,8 +11,6 @@ from mivol.transport.estimators.scores import IMAGE
 from mivol.transport.estimators.segment import Absorption, PathSegment, SegmentLight, SegmentTransmittance
 from scenes import box_of, camera, centred, media_of, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 KEY = "box.interior_medium.sigma_t.value.value"
 
 

@@ -35,8 +35,6 @@ from mivol.transport.traversal.random_numbers import draw_state
 from mivol.validate.statistics import Moments
 from scenes import ball_of, camera, media_of, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 N, G, LOBE, SIGMA, ALBEDO, SUN = 1 << 16, 0.6, 0.8, 0.7, 0.9, 2.0
 
 

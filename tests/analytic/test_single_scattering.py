@@ -29,8 +29,6 @@ from mivol.transport.estimators.single_scattering.scattering_derivatives import 
 from mivol.transport.media.scene_media import SceneMedia
 from scenes import affine, as_float32, ball_of, box_of, camera, centred, grid_volume, media_of, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 SPP = 1024
 
 

@@ -14,8 +14,6 @@ from mivol.fields.harmonics import basis_size, harmonic_degree, row_width
 from mivol.fields.resampling import resample_field
 from mivol.fields.spherical_grid import SphericalGrid
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 @pytest.mark.parametrize(("degree", "basis", "width"), [(0, 1, 4), (1, 4, 12), (2, 9, 28), (3, 16, 48), (4, 25, 76)])
 def test_rows_of_harmonics(degree: int, basis: int, width: int) -> None:

@@ -15,8 +15,6 @@ from mivol.transport.media.stock_grids import StockGrids, find_grid_place
 from mivol.transport.traversal.box import Box, fit_box
 from scenes import FRAMES, box_of, centred, grid_volume, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 VALUES = np.ones((3, 4, 5, 1), np.float32)
 
 

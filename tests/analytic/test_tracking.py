@@ -39,8 +39,6 @@ from mivol.transport.traversal.rays import FineRay
 from mivol.validate.statistics import Moments
 from scenes import as_float32, make_lattice, media_of, refused
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 Q = 25.0
 """2 exp(-25) = 3e-11: the chance of each of the means that are compared here, some 100 in a test."""
 

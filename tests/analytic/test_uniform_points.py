@@ -21,8 +21,6 @@ from mivol.transport.media.ray_intervals import (
 from mivol.transport.media.scene_media import SceneMedia
 from scenes import ball_of, box_of, camera, centred, grid_volume, media_of, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 N = 1024
 
 

@@ -11,8 +11,6 @@ from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.scene_media import SceneMedia
 from scenes import camera, media_of, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 ROUNDING = 4 * 2.0**-23
 
 

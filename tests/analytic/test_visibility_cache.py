@@ -26,8 +26,6 @@ from mivol.transport.path.estimators import Settings
 from mivol.transport.traversal.grid_blocks import coarsen_grid
 from scenes import centred
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 SIZE = (9, 14, 11)
 
 TWO = centred(2 * np.eye(3))

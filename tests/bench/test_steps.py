@@ -14,8 +14,6 @@ import pytest
 from mivol.bench.studies import steps as study
 from mivol.errors import MivolError
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def test_launches_are_those_of_the_call() -> None:
     """Two kernels and a sum, none of what is computed before or after."""

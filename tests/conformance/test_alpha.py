@@ -11,7 +11,7 @@ from scattering_scenes import cases, fog, mivol, moments, rough_grid, smoke, vol
 from mivol.validate.statistics import Moments
 from scenes import ball_of, camera, film, medium, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb", "traced_balls")
+pytestmark = pytest.mark.usefixtures("traced_balls")
 
 RGBA = film(8, 8) | {"pixel_format": "rgba"}
 

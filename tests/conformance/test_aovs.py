@@ -17,8 +17,6 @@ from mivol.errors import MivolError
 from mivol.transport.line_integrals import aovs
 from scenes import as_float32, ball_of, box_of, camera, centred, grid_volume, medium, render, rotation, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 TURNED = as_float32(centred(rotation([1, 2, 0], 0.5), (0.1, 0, 0)))
 SMALL = as_float32(centred(0.5 * rotation([1, 2, 0], 0.5), (0.05, 0, 0)))
 RGB = [0.9, 0.2, 3.0]

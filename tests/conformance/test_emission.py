@@ -44,7 +44,7 @@ from scenes import (
     skip_recorded_grids_on_a_gpu,
 )
 
-pytestmark = pytest.mark.usefixtures("variant_rgb", "traced_balls")
+pytestmark = pytest.mark.usefixtures("traced_balls")
 
 EPS = 2.0**-23
 

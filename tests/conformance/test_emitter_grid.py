@@ -15,8 +15,6 @@ from volpath_scenes import LEAK, area, floor, panorama, textured
 from mivol.transport.estimators.lighting.emitter_grid import EVEN_SHARE, MARGIN, MAX_CELLS, MEAN_SHARE
 from mivol.transport.estimators.lighting.emitters import SceneEmitters
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 STRONG, WEAK = [1.5, -1.0, 1.8], [-1.6, 0.9, 0.4]
 ROUNDING = 2.0**-20
 

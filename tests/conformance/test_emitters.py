@@ -13,8 +13,6 @@ from volpath_scenes import EMITTERS, same
 from mivol.transport.estimators.lighting.emitters import EquiangularSampler, EventSamples, SceneEmitters, make_ball_sampler
 from mivol.transport.traversal.random_numbers import fork_state
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 @pytest.mark.slow_for("envmap", "several")
 @pytest.mark.statistical

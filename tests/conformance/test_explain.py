@@ -11,8 +11,6 @@ from mivol.experiments.script import explain
 from mivol.scene.explain import choose_recording
 from scenes import ball_of, box_of, camera, centred, grid_volume, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 PLACE = centred(2 * np.eye(3))
 
 

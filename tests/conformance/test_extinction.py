@@ -24,8 +24,6 @@ from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridE
 from mivol.transport.traversal.grid_blocks import bound_blocks, find_distances_of_bounds
 from mivol.transport.traversal.lattice import Lattice
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 RES, RAYS = (9, 10, 11), 64
 BOX = np.diag([2.0, 2.0, 2.0, 1.0]) + np.pad(np.full((3, 1), -1.0), ((0, 1), (3, 0)))
 """The unit cube as [-1, 1]^3."""

@@ -16,8 +16,6 @@ from mivol.fields.plugin_field import PluginField
 from mivol.fields.protocol import BOUNDED, EXACT_LINE, Field
 from mivol.fields.voxels import Voxels
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 POINTS = 5000
 
 

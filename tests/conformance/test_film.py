@@ -28,8 +28,6 @@ from mivol.transport.path.film import count_passes
 from mivol.validate.statistics import Moments
 from scenes import box_of, camera, grid_volume, medium, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 PLACE = scenes.centred(2 * np.eye(3))
 
 

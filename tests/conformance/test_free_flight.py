@@ -15,8 +15,6 @@ from mivol.transport.estimators.flights import free_flight
 from mivol.validate.statistics import Moments
 from scenes import as_float32, ball_of, box_of, centred, grid_volume, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def volpath(**more: object) -> dict:
     return {"type": "volpath", "max_depth": -1, "rr_depth": 1000, **more}

@@ -12,8 +12,6 @@ from mivol.errors import MivolError
 from mivol.fields.voxels import Voxels
 from scenes import box_of, camera, grid_volume, medium, skip_recorded_grids_on_a_gpu, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 GRID, SCALE = "box.interior_medium.sigma_t.data", "box.interior_medium.scale"
 PLACE = scenes.centred(2 * np.eye(3))
 

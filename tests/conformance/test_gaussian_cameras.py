@@ -16,8 +16,6 @@ from scipy.special import logit
 from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, HARMONICS
 from mivol.points.gaussians import Gaussians
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 ROUNDING = 1e-4
 """Of light, relative to colours of at most 2 (test_gaussian_radiance.py)."""
 

@@ -24,8 +24,6 @@ from mivol.points import write_gaussians
 from mivol.points.gaussians import Gaussians
 from mivol.splatting import Splatter, to_tensors
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 SKY, SCALE = 0.8, 1.3
 
 POINT = {"type": "point", "position": [1.5, 2.0, 2.5], "intensity": 10.0}

@@ -24,7 +24,7 @@ from mivol.points import write_gaussians
 from mivol.points.gaussians import Gaussians
 from mivol.splatting import Splatter, to_tensors
 
-pytestmark = pytest.mark.usefixtures("variant_rgb", "traced_balls")
+pytestmark = pytest.mark.usefixtures("traced_balls")
 
 ROUNDING = 1e-4
 """Of light in float32, relative to colours of at most 2: a depth of one Gaussian is known to 2e-5

@@ -14,8 +14,6 @@ from mivol.fields.blackbody import blackbody_rgb, planck, tabulated_rgb
 from mivol.files import SparseVolumeData, VolumeData, frame_from_steps, read_volume, write_grids
 from scenes import box_of, refused
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def hot(values: np.ndarray, **more: object) -> np.ndarray:
     """The colours (Z, Y, X, 3) of a ``mivol_blackbody``."""

@@ -19,8 +19,6 @@ from mivol.scene.survey import survey_scene
 from mivol.transport.path.estimators import Settings
 from scenes import ball_of, box_of, centred, medium, refused, render, skip_recorded_grids_on_a_gpu, sky, tensor
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 AUTO = {"type": "mivol", "max_depth": 2, "rr_depth": 100}
 
 R, J = 0.3, np.array([9.0, 6.0, 3.0])

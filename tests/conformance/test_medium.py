@@ -10,8 +10,6 @@ from scattering_scenes import cases
 
 from scenes import box_of, camera, grid_volume, medium, refused, render, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 VALUES = np.ones((3, 4, 5, 1), np.float32)
 
 

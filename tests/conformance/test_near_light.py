@@ -42,8 +42,6 @@ from mivol.transport.estimators.single_scattering.near_light import NearLighting
 from mivol.transport.path.estimators import Settings
 from scenes import ball_of, box_of, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 SEGMENTS = {"near_light": "segments"}
 
 

@@ -20,8 +20,6 @@ from mivol.scene.survey import survey_scene
 from mivol.transport.path.estimators import Settings
 from scenes import ball_of, box_of, camera, film, grid_volume, medium, refused, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 PLACE = scenes.centred(2 * np.eye(3))
 
 

@@ -12,8 +12,6 @@ from scattering_scenes import close_up, mivol, moments, rough_grid, smoke
 from mivol.validate.statistics import Moments
 from scenes import ball_of, medium, pencil, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
 """From linear sRGB, as ``moment`` converts what it squares (ITU-R BT.709 primaries, to 6 digits)."""
 

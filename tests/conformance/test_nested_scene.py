@@ -25,8 +25,6 @@ from mivol.transport.line_integrals.radiance_field import find_occupied_cells, m
 from mivol.transport.line_integrals.radiance_source import make_exact
 from scenes import ball_of, box_of, camera, centred, medium, refused, rotation, sky, tensor
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 TURNED = centred(1.2 * rotation([1, 2, 3], 0.5), (0.1, 0.2, 0.3))
 FLAT = centred(1.2 * np.eye(3), (0.1, 0.2, 0.3))
 RES = (5, 6, 7)

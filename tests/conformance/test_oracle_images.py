@@ -34,8 +34,6 @@ from scenes import (
     sky,
 )
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 BOUND = 2e-6
 EPS = 2.0**-23
 ODD_FRAMES = ("stretched", "rotated", "sheared", "mirrored")

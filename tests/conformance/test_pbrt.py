@@ -27,8 +27,6 @@ from mivol.files.mesh import Mesh, write_mesh
 from mivol.scene.pbrt import fold_direction, unfold_sky
 from mivol.scene.pbrt_media import noise
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 HEAD = """LookAt 0 0 -4  0 0 0  0 1 0   # the eye
 Camera "perspective" "float fov" 0.02
 Film "rgb" "integer xresolution" [ 3 ] "integer yresolution" [ 3 ] "string filename" "a.exr"

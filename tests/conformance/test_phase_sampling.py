@@ -14,8 +14,6 @@ from volpath_scenes import EMITTERS, same
 import scenes
 from scenes import box_of, grid_volume, medium, refused, transform
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def microflakes(voxels: int = 1) -> dict:
     """Microflakes: a random symmetric matrix in each voxel of a row (xx, yy, zz, xy, xz, yz)."""

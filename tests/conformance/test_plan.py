@@ -20,8 +20,6 @@ from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path.estimators import Settings
 from scenes import sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 GIB = 2**30
 
 

@@ -20,7 +20,7 @@ from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.traversal.random_numbers import seed_pcg32
 from scenes import ball_of, box_of, centred, media_of, medium, rotation
 
-pytestmark = pytest.mark.usefixtures("variant_rgb", "traced_balls")
+pytestmark = pytest.mark.usefixtures("traced_balls")
 
 
 def walls(**more: object) -> dict:

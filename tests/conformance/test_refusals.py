@@ -13,8 +13,6 @@ from scattering_scenes import close_up, fog, mivol
 from mivol.errors import MivolError, reveal_refusals
 from scenes import grid_volume, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 MOVED = "the derivative of fog.vertex_positions was requested"
 KEY, PLACE = "fog.interior_medium.sigma_t.value.value", "fog.vertex_positions"
 

@@ -11,8 +11,6 @@ from volpath_scenes import LEAK, grid_in, lit
 import scenes
 from scenes import ball_of, box_of
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 @pytest.mark.slow_for("ball")
 @pytest.mark.statistical

@@ -17,8 +17,6 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import Settings
 from mivol.transport.path.walk import LONG_PATH
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 GLASS, ROUGH, NONE = {"type": "dielectric"}, {"type": "roughdielectric", "alpha": 0.3}, {"type": "null"}
 
 

@@ -12,8 +12,6 @@ import pytest
 from mivol.scene.sensors import check_film
 from scenes import pencil, refused, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def test_a_picture_is_computed_at_once_or_when_it_is_looked_at():
     """Mitsuba's ``evaluate``; the numbers are the same."""

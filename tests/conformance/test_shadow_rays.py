@@ -15,8 +15,6 @@ from mivol.transport.estimators.lighting.shadow_rays import ROULETTE_TAU, find_t
 from mivol.transport.traversal.random_numbers import seed_pcg32
 from scenes import box_of, grid_volume, media_of, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 @pytest.mark.slow
 @pytest.mark.statistical

@@ -15,8 +15,6 @@ from mivol.validate.reference import render_reference
 from mivol.validate.statistics import Moments
 from scenes import box_of, centred, grid_volume, medium, sky, transform
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 LEAK = 1e-4
 """What volpath's shadow rays miss behind each boundary, of a radiance of 1."""
 

@@ -14,8 +14,6 @@ from mivol.scene.needs import find_needs
 from mivol.scene.survey import survey_scene
 from mivol.transport.path.estimators import Settings
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 @pytest.mark.slow_for("sun")
 @pytest.mark.statistical

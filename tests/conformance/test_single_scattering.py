@@ -31,9 +31,6 @@ from mivol.validate.reference import render_reference
 from mivol.validate.statistics import Moments
 from scenes import as_float32, ball_of, box_of, centred, grid_volume, medium, rotation
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
-
 # -- Boundaries, media, places of the camera -------------------------------------------------------------------------
 
 

@@ -29,8 +29,6 @@ from scenes import FRAMES, box_of, medium, random_rays, sky
 ROUNDING = 1e-6
 INSIDE = "smoke.interior_medium."
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def patches(rng: np.random.Generator, shape: tuple[int, int, int], channels: int = 1, share: float = 0.3) -> np.ndarray:
     """Random values (Z, Y, X, C) in random patches; the corners of the box are filled, whose outer half voxels are constant."""

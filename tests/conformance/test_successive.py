@@ -27,8 +27,6 @@ from mivol.transport.path.successive import paths_per_lane, walk_branching, walk
 from mivol.transport.path.walk import walk_path
 from scenes import ball_of, box_of, camera, grid_volume, medium, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 ENDLESS = mivol(max_depth=-1)
 
 

@@ -16,8 +16,6 @@ from mivol.scene_graph import traverse
 from mivol.transport.media.scene_media import SceneMedia
 from scenes import as_float32, box_of, medium, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def turned(angle: float = 30.0) -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f().translate([0.3, -0.5, 2.0]).rotate([1, 2, 3], angle)

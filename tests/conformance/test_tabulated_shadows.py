@@ -27,8 +27,6 @@ from mivol.transport.path import successive
 from mivol.transport.path.estimators import Settings
 from scenes import box_of, centred, grid_volume, medium, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 DEPTH = 6
 
 

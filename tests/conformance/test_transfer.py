@@ -16,8 +16,6 @@ from mivol.experiments.script import explain
 from mivol.fields.transfer import gradient_grid
 from scenes import as_float32, box_of, centred, rotation, tensor, transform
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 DOMAIN = (-500.0, 1500.0)
 OPACITY = as_float32([0, 0, 0.2, 3, 1, 6])
 COLOUR = as_float32([[0, 0, 0], [0.1, 0, 0], [0.9, 0.3, 0.1], [0.2, 0.7, 0.3], [0.3, 0.4, 0.9], [1, 1, 0.9]])

@@ -151,7 +151,6 @@ LAYERS = {(0, 0): 14.0, (7, 7): 14.0 + 2 - 0.25}
 outside, 0.25, of which the last is 2 in the last row."""
 
 
-@pytest.mark.usefixtures("variant_rgb")
 @pytest.mark.parametrize("storage", ["dense", "sparse"])
 def test_light_through_tiles_and_background(tmp_path: Path, storage: str) -> None:
     """Beer and Lambert: the optical depth of a row is the sum of its voxels times their edge, the outer half voxels included.
@@ -218,7 +217,6 @@ def test_a_grid_is_chosen_by_name(openvdb_file: Path) -> None:
         read_volume(openvdb_file, "empty")
 
 
-@pytest.mark.usefixtures("variant_rgb")
 def test_a_plugin_names_the_grid(openvdb_file: Path) -> None:
     text = f"""<scene version="3.0.0"><shape type="cube"><medium name="interior" type="mivol_medium">
         <volume name="sigma_t" type="mivol_voxels"><string name="filename" value="{openvdb_file}"/>

@@ -12,8 +12,6 @@ import scenes
 from mivol.validate.statistics import Moments
 from scenes import ball_of, box_of, camera, grid_volume, medium, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 PLACE = scenes.centred(2 * np.eye(3))
 RED = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.3, 0.2]}}
 

@@ -32,8 +32,6 @@ from mivol.validate.metrics import score_image
 from mivol.validate.reference_file import check_identity
 from mivol.validate.statistics import Estimate, p_value
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def refusal_of(called: object, *arguments: object, **settings: object) -> str:
     with pytest.raises(MivolError) as refused:

@@ -22,8 +22,6 @@ from mivol.optim.photographs.field_view import FieldView
 from mivol.photos import Camera, intrinsics
 from mivol.validate.metrics import ImageScore
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 RES = (3, 4, 5)
 EDGES = (2.0, 1.0, 0.5)
 

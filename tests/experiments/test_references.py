@@ -125,8 +125,6 @@ def test_a_faint_light_that_a_reference_has_missed_is_no_difference() -> None:
     assert np.abs(z[events == 0]).max() < 5
 
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 KEY = "smoke.interior_medium.sigma_t.data"
 
 

@@ -14,8 +14,6 @@ from mivol.experiments.octree_fit import OctreeFit
 from mivol.optim.photographs.sampled_problem import PRESETS
 from mivol.photos import Camera, intrinsics
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def settings_of(**field: object) -> SimpleNamespace:
     return SimpleNamespace(field=SimpleNamespace(**{"effort": 1.0, **field}))

@@ -12,8 +12,6 @@ from mivol.experiments import scan_corrections as corrections
 from mivol.experiments.projections import Projections
 from mivol.tomography.geometry import ConeBeam, ParallelBeam
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 ROWS, COLUMNS = 13, 4
 ANGLES = np.linspace(0, np.pi, 3, endpoint=False)
 

@@ -14,7 +14,7 @@ from mivol.transport.line_integrals.aovs import integrate_distance_in_cell
 from mivol.transport.media.compositing import CellIntegral
 from scenes import as_float32, ball_of, box_of, camera, centred, grid_volume, medium, pencil, rotation, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb", "traced_balls")
+pytestmark = pytest.mark.usefixtures("traced_balls")
 
 CUBE = centred(np.eye(3))
 TURNED = as_float32(centred(rotation([1, 2, 0], 0.5), (0.1, 0, 0)))

@@ -21,8 +21,6 @@ from mivol.transport.traversal.box import Box
 from mivol.transport.traversal.lattice import Lattice
 from scenes import box_of, grid_volume, medium, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 DENSITY = "smoke.interior_medium.sigma_t.data"
 
 

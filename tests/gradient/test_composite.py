@@ -11,7 +11,7 @@ from aov_gradients import DATA, VALUE, mivol, vjp
 
 from scenes import as_float32, ball_of, box_of, centred, grid_volume, medium, pencil
 
-pytestmark = pytest.mark.usefixtures("variant_rgb", "traced_balls")
+pytestmark = pytest.mark.usefixtures("traced_balls")
 
 
 def column(sigma: np.ndarray, boundary: dict | None = None) -> mi.Scene:

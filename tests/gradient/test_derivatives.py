@@ -28,8 +28,6 @@ from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.walk import Path, walk_part
 from scenes import ball_of, box_of, camera, grid_volume, medium, skip_recorded_grids_on_a_gpu, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 MEDIUM = "smoke.interior_medium."
 KEYS = {
     "density": MEDIUM + "sigma_t.data",

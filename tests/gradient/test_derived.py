@@ -13,8 +13,6 @@ from scattering_scenes import PLACE, mivol, point, rough_grid
 
 from scenes import box_of, grid_volume, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 INSIDE = "smoke.interior_medium."
 TABLE = "0.3, 1, 0.2, 0.6, 2.5"
 

@@ -27,7 +27,7 @@ from emission_scenes import (
 from mivol.scene import plan
 from scenes import affine, as_float32, box_of, camera, centred, grid_volume
 
-pytestmark = pytest.mark.usefixtures("variant_rgb", "traced_balls")
+pytestmark = pytest.mark.usefixtures("traced_balls")
 
 DATA = ("sigma_t.data", "albedo.data", "emission.data", "emission_density.data")
 VALUE = ("sigma_t.value.value", "albedo.value.value", "emission.value.value", "emission_density.value.value")

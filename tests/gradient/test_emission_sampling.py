@@ -9,8 +9,6 @@ from false_alarms import assert_precise, assert_same_mean, difference, fresh
 from media_light_scenes import drawn, met, seen
 from scattering_gradients import along, assert_transposed, backward, forward
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 FIRE = "fire.interior_medium."
 KEYS = {
     ("over a floor", "sigma_t"): FIRE + "sigma_t.data",

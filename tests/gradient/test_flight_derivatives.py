@@ -40,8 +40,6 @@ from mivol.transport.traversal.rays import FineRay
 from mivol.validate.statistics import Moments
 from scenes import as_float32, ball_of, box_of, camera, grid_volume, media_of, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 MEDIUM = "smoke.interior_medium."
 
 

@@ -15,8 +15,6 @@ import scenes
 from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS
 from mivol.validate.statistics import Estimate, Moments
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 INSIDE = "cloud.interior_medium."
 
 PARAMETERS = {name: f"{INSIDE}sigma_t.{name}" for name in EXTINCTION_PARAMETERS} | {"scale": INSIDE + "scale"}

@@ -18,7 +18,7 @@ from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, HARMONICS
 from mivol.points.gaussians import CONSTANT_HARMONIC
 from mivol.validate.statistics import Estimate, Moments
 
-pytestmark = pytest.mark.usefixtures("variant_rgb", "traced_balls")
+pytestmark = pytest.mark.usefixtures("traced_balls")
 
 SIDE, BATCHES = 8, 16
 

@@ -18,8 +18,6 @@ import scenes
 from mivol.validate.statistics import Moments
 from scenes import as_float32, box_of, grid_volume, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 @pytest.mark.slow
 @pytest.mark.statistical

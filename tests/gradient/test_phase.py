@@ -12,8 +12,6 @@ from phase_angles import EPS, f32, lanes
 from mivol.phase.closed_forms import ScatteringAngle, angle_between, eval_draine, eval_hg, normalise_weights
 from mivol.phase.table import Lookup, Table
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 NEAR = np.geomspace(1e-6, 1, 100)
 ANGLES = np.concatenate([[0, np.pi], NEAR, np.linspace(1.01, 2.1, 60), np.pi - NEAR])
 

@@ -37,8 +37,6 @@ from mivol.transport.media.ray_intervals import RaySegment
 from mivol.validate.statistics import Moments
 from scenes import as_float32, box_of, centred, grid_volume, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 MEDIUM = "smoke.interior_medium."
 
 

@@ -16,8 +16,6 @@ from scattering_scenes import mivol, pencils, sun
 
 from scenes import affine, box_of, grid_volume, medium
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 MU, ALBEDO, IRRADIANCE = 0.6, 0.8, 2.0
 VIEW = np.array([0.36, 0.48, 0.8])
 """Slanted, so that no distance to the face is a float32 number by chance."""

@@ -20,8 +20,6 @@ from mivol.transport.traversal.box import Box
 from mivol.transport.traversal.grid_walk import walk_box_cells, walk_planes
 from scenes import FRAMES, affine, as_float32, random_rays, tau_fast, to_lanes
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 @pytest.mark.parametrize("zero", [0.0, -0.0])
 @pytest.mark.parametrize("axis", [0, 1, 2])

@@ -12,8 +12,6 @@ from oracle import tau_scale
 
 from scenes import FRAMES, affine, as_float32, centred, make_lattice, random_rays, rotation, tau_fast
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 def test_origin_inside_or_on_a_face():
     rng = np.random.default_rng(16)

@@ -18,8 +18,6 @@ from hard_rays import EPS, assert_tau, positive
 from mivol.threads import set_thread_count
 from scenes import affine, as_float32, centred, make_lattice, random_rays, tau_and_row, tau_fast, to_lanes
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 @pytest.mark.parametrize("power", [-8, -4, 0, 2, 4])
 def test_any_optical_depth(power):

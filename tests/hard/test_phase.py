@@ -10,8 +10,6 @@ import pytest
 
 from scenes import box_of, camera, refused, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 EPS = 2.0**-23
 N = 2**16
 

@@ -32,8 +32,6 @@ from mivol.transport.traversal.lattice import clip_to_grid
 from mivol.transport.traversal.occupied_walk import walk_occupied_cells
 from scenes import box_of, tensor, transform
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 Y0 = 0.28209479177387814
 """The constant harmonic, 1 / sqrt(4 pi)."""
 

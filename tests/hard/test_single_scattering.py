@@ -16,8 +16,6 @@ from scattering_scenes import PLACE, aimed, fog, mivol, pencils, point, rough_gr
 import scenes
 from scenes import as_float32, box_of, centred, grid_volume, medium, refused, tensor
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 GRID = "smoke.interior_medium.sigma_t.data"
 ALBEDO = "smoke.interior_medium.albedo.value.value"
 EPS = 2.0**-23

@@ -11,8 +11,6 @@ from mivol.optim.first_order import LARGEST, LONGEST_MEMORY, Adam, RMSprop, desc
 from mivol.optim.optimizer import SCHEDULES, Constant, Cosine, Exponential, Step
 from mivol.optim.problem import Refinement
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 class Given:
     """Two parameters with derivatives that are drawn, and a bound from below for one of them."""

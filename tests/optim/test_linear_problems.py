@@ -61,9 +61,6 @@ def test_total_variation_of_a_step_is_its_area_times_height():
     assert prior.value(x.reshape(-1)) == pytest.approx(0.25 * 3 * 5 * 0.5 * 4 * 2, rel=1e-8)
 
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
-
 def scan_in(unit: float) -> tuple[Projector, np.ndarray, np.ndarray]:
     """A cylinder in a small parallel scan whose lengths are ``unit`` times as large, and weights; rays miss middles."""
     grid = VoxelGrid((8, 16, 16), unit / 8)

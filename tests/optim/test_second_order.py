@@ -10,8 +10,6 @@ import pytest
 
 from mivol.optim.second_order import Lbfgs, LbfgsRun, apply_inverse_hessian, search_line
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 
 class Bowl:
     """1/2 (x - c)^T A (x - c) in float64, of one parameter with bounds; each call of the loss is counted."""

@@ -158,7 +158,6 @@ def test_unusable_fields_are_refused(change, sentence):
 
 @pytest.mark.slow
 @pytest.mark.statistical
-@pytest.mark.usefixtures("variant_rgb")
 def test_axis_is_found_three_ways(simulated):
     """Simulated axis at 35.30, noise of 2 % a pixel: as near as each method claims, and its claims are small.
 
@@ -199,7 +198,6 @@ def test_mirror_pairs_need_half_a_turn():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("variant_rgb")
 def test_tooth_axis_and_held_out_views_small(data_dir):
     """One of the two rows, columns summed by 2. The axis is known: others put it at column 296 of 640, to half a pixel.
 
@@ -231,7 +229,6 @@ def test_tooth_at_full_size(data_dir, tmp_path):
     assert (tmp_path / "tooth.png").stat().st_size > 50_000
 
 
-@pytest.mark.usefixtures("variant_rgb")
 def test_cone_beam_of_a_ct_volume_is_inverted(data_dir):
     """A measured volume as truth, projected at twice the resolution that it is reconstructed at (no inverse crime)."""
     fine = read_volume(data_dir / "ct_mri" / "tooth.nrrd").values[..., 0].astype(np.float32)

@@ -17,8 +17,6 @@ from oracle import tau_scale
 
 from scenes import FRAMES, as_float32, random_rays, tau_fast
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 BOUND = 2e-6
 N_RAYS = 64
 

@@ -19,8 +19,6 @@ from mivol.report.record import RunRecord, write_record
 from mivol.view.subjects import Look, RunSubject, find_model, open_subject
 from mivol.view.transfer import Transfer
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
-
 CAMERA = make_camera([0.5, -3, 0.5, 0.5, 0.5, 0.5], (0, 0, 1), 30, (32, 24))
 LEFT = (0.0, 0.0, 0.0, 0.5, 1.0, 1.0)
 """The half of the unit cube with x below 0.5, on the left of the pictures."""
