@@ -41,7 +41,7 @@ ON_A_GPU = (
     "conformance/test_surfaces.py",
     "gradient/test_derivatives.py",
     "gradient/test_flight_derivatives.py",
-    "gradient/test_grid_integral.py",
+    "gradient/test_grid_extinction.py",
     "gradient/test_splatter.py",
     "hard/test_optical_depth.py",
     "optim/test_radiance_problem.py",

@@ -107,7 +107,7 @@ def tau_fast(
     skip: bool | str = False,
 ) -> np.ndarray:
     """Optical depth (n, C) of rays (n, 3) by the code under test."""
-    from mivol.transport.media.grid_integral import integrate_tau
+    from mivol.transport.media.grid_extinction import integrate_tau
 
     o, d = np.broadcast_arrays(np.atleast_2d(o), np.atleast_2d(d))
     ends = mi.Float(np.broadcast_to(np.float32(t_max), len(o)).copy())
@@ -123,7 +123,7 @@ def tau_and_row(
     skip: bool | str = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Optical depth through a grid of ones, and the sum over rays of its gradient (Z, Y, X), by the code under test."""
-    from mivol.transport.media.grid_integral import integrate_tau
+    from mivol.transport.media.grid_extinction import integrate_tau
 
     o, d = np.broadcast_arrays(np.atleast_2d(o), np.atleast_2d(d))
     values = tensor(np.ones(shape))

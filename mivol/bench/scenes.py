@@ -27,7 +27,7 @@ from mivol.bench.harness.contests import Contestant, race
 from mivol.fields.procedural import make_procedural
 from mivol.files import read_volume
 from mivol.optim.events import upsample
-from mivol.transport.media.grid_integral import integrate_tau
+from mivol.transport.media.grid_extinction import integrate_tau
 from mivol.transport.traversal.grid_blocks import find_empty_distances
 from mivol.transport.traversal.lattice import Lattice
 

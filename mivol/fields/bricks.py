@@ -1,6 +1,6 @@
 """Where the values of a sparse grid are stored: in bricks of 8^3 nodes with a table of the bricks of its box, or node by node.
 
-Conventions. Those of :mod:`mivol.files.sparse_volume`. The *slot* of a node is its row among the stored values: the first slot
+Conventions. Those of :mod:`mivol.files.volume`. The *slot* of a node is its row among the stored values: the first slot
 of its brick plus its place in the brick (z, y, x). A node of a brick that is not stored has the value 0 and no derivative.
 
 :class:`SparseIndex` stores single nodes instead, in ascending order. The row of a stored node is its rank, the number of stored
@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.files.sparse_volume import EDGE, VOXELS, count_bricks
+from mivol.files.volume import EDGE, VOXELS, count_bricks
 from mivol.numerics import fast_max, fast_min
 
 __all__ = [

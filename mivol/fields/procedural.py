@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from mivol.errors import MivolError
 from mivol.files import SparseVolumeData
-from mivol.files.sparse_volume import EDGE, VOXELS
+from mivol.files.volume import EDGE, VOXELS
 
 
 def tangle(p: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -22,7 +22,7 @@ from mivol.fields.bricks import Bricks, Nodes
 from mivol.fields.protocol import EXACT_LINE, GridValues
 from mivol.files import SparseVolumeData, check_bricks, check_volume, is_sparse_file, read_sparse_volume, read_volume
 from mivol.files.source import refusal
-from mivol.files.sparse_volume import EDGE, count_bricks, measure_stored_share
+from mivol.files.volume import EDGE, count_bricks, measure_stored_share
 from mivol.kernel_recording import copy_aligned, is_recording
 from mivol.space import check_affine
 

@@ -20,8 +20,16 @@ from mivol.files.image_files import decode_srgb, encode_srgb, read_exr, read_exr
 from mivol.files.image_stack import read_slices, read_stack
 from mivol.files.scan_hdf5 import ProjectionData, read_projections
 from mivol.files.source import read_columns
-from mivol.files.sparse_volume import SparseVolumeData, check_bricks
-from mivol.files.volume import VolumeData, check_frame, check_volume, frame_from_box, frame_from_steps, to_space
+from mivol.files.volume import (
+    SparseVolumeData,
+    VolumeData,
+    check_bricks,
+    check_frame,
+    check_volume,
+    frame_from_box,
+    frame_from_steps,
+    to_space,
+)
 
 __all__ = [
     "FORMATS",

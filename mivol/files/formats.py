@@ -39,8 +39,7 @@ from mivol.files import (
 )
 from mivol.files.atomic import write_whole
 from mivol.files.source import check_file, refusal, refuse_dataset
-from mivol.files.sparse_volume import SparseVolumeData
-from mivol.files.volume import VolumeData, check_frame, frame_from_steps, is_upright, to_values
+from mivol.files.volume import SparseVolumeData, VolumeData, check_frame, frame_from_steps, is_upright, to_values
 
 #: Number of first bytes that identify a format.
 HEAD = 4096

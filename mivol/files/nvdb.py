@@ -21,9 +21,8 @@ import numpy as np
 
 from mivol.files.npy import check_memory
 from mivol.files.source import decompress, read_bytes, refusal, select_dataset
-from mivol.files.sparse_volume import EDGE, SparseVolumeData, allocate_bricks
 from mivol.files.vdb import decompress_blosc
-from mivol.files.volume import VolumeData, frame_from_steps
+from mivol.files.volume import EDGE, SparseVolumeData, VolumeData, allocate_bricks, frame_from_steps
 
 MAGIC = (b"NanoVDB0", b"NanoVDB2")
 

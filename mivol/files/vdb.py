@@ -28,8 +28,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.files.npy import check_memory
 from mivol.files.source import check_file, decompress, refusal, select_dataset
-from mivol.files.sparse_volume import SparseVolumeData, allocate_bricks
-from mivol.files.volume import VolumeData, frame_from_steps, to_values
+from mivol.files.volume import SparseVolumeData, VolumeData, allocate_bricks, frame_from_steps, to_values
 
 MAGIC = b" BDV\0\0\0\0"
 

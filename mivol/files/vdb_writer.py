@@ -16,8 +16,8 @@ import numpy as np
 
 from mivol.files.nvdb import FACTS, GRID_HEAD, INNER, LAYOUTS, TREE_HEAD, Layout
 from mivol.files.source import refusal
-from mivol.files.sparse_volume import EDGE, SparseVolumeData
 from mivol.files.vdb import ACTIVE_VALUES, LEAF, LEVELS, MAGIC, ZIP, Coord
+from mivol.files.volume import EDGE, SparseVolumeData
 
 #: channels -> type of a grid's values.
 TYPES = {1: "float", 3: "vec3s"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from mivol.files.sparse_volume import VOXELS
+from mivol.files.volume import VOXELS
 from mivol.scene.needs import MediumFacts, Needs
 from mivol.transport.media.body import flight_parts
 from mivol.transport.media.medium_view import MediumView

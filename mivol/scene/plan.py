@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from mivol.back_end import free_memory
 from mivol.errors import MivolError
-from mivol.files.sparse_volume import VOXELS
+from mivol.files.volume import VOXELS
 from mivol.scene.choices import (
     MAX_SKIPPED_SHARE,
     MAX_TRIMMED_SHARE,
@@ -63,7 +63,7 @@ from mivol.transport.estimators.lighting.tabulated_shadows import TransmittanceG
 from mivol.transport.estimators.single_scattering.near_light import NearLighting
 from mivol.transport.estimators.single_scattering.single_scattering import PROBE_DEPTH
 from mivol.transport.estimators.single_scattering.visibility_cache import VisibilityCache, build_visibility_cache
-from mivol.transport.media.grid_integral import gradient_bytes, packs_gradient
+from mivol.transport.media.grid_extinction import gradient_bytes, packs_gradient
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import (
     SEGMENT_ESTIMATORS,

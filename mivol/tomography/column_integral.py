@@ -4,7 +4,7 @@ Most rays of a scanner are of this kind: the rows of the detector lie across the
 the axis. A ray moves between columns at the planes of the other axes. At each layer of the axis, and after every PIECE voxels,
 the ray starts afresh from its position in float64. The loop over cells then tests two planes, changes two columns and needs no
 compensated sums: half the instructions of the general walk (:mod:`mivol.transport.traversal.grid_walk`). The integrals equal
-:mod:`mivol.transport.media.grid_integral` to rounding, for one channel and no empty blocks.
+:mod:`mivol.transport.media.grid_extinction` to rounding, for one channel and no empty blocks.
 
 Conventions. Axes are numbered x, y, z. The nodes are padded by one on each side with the values of the outermost nodes, so no
 index is clamped. Cells are those of :mod:`mivol.transport.traversal.lattice`. Columns of a cell are numbered near (0) or far

@@ -3,7 +3,7 @@ back-projection.
 
 Conventions. x is a grid (Z, Y, X) [1/length] of the trilinear model (values at voxel centres, clamped borders, nothing outside
 the box); y are projections (views, rows, cols), without unit. Both may be flat; the result has the form of the input. Both are
-float32. Both operators are the sums defined in :mod:`mivol.transport.media.grid_integral`, so the pair is matched: ``<A x, y>
+float32. Both operators are the sums defined in :mod:`mivol.transport.media.grid_extinction`, so the pair is matched: ``<A x, y>
 = <x, A.T y>`` to rounding.
 
 Rays are set up in float64: origins move to a sphere around the grid and are measured from its centre, so a source or an object
@@ -34,7 +34,7 @@ from mivol.tomography.column_integral import (
     zero_nodes,
 )
 from mivol.tomography.geometry import Geometry, VoxelGrid, view_index
-from mivol.transport.media.grid_integral import NodeGradient, backproject_segment, integrate_segment
+from mivol.transport.media.grid_extinction import NodeGradient, backproject_segment, integrate_segment
 from mivol.transport.traversal.box import clip_to_box
 from mivol.transport.traversal.grid_blocks import find_empty_distances, read_distances
 from mivol.transport.traversal.lattice import Lattice, clip_to_grid

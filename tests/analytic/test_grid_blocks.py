@@ -106,7 +106,7 @@ def test_gaps_are_the_distances_between_blocks():
 @pytest.mark.parametrize("skip", [False, True, "ends"])
 def test_gradient_in_and_out_of_the_shell(skip):
     """d tau / d sigma does not know sigma: the voxels of an empty block have the same row of A as all others."""
-    from mivol.transport.media.grid_integral import integrate_tau
+    from mivol.transport.media.grid_extinction import integrate_tau
 
     values = tensor(shell(24))
     dr.enable_grad(values)

@@ -30,8 +30,7 @@ from mivol.transport.estimators.flights.tracking import (
 from mivol.transport.estimators.scores import IMAGE
 from mivol.transport.estimators.segment import PathSegment
 from mivol.transport.media.extinction import BoundedExtinction, RayInterval
-from mivol.transport.media.grid_extinction import GridExtinction
-from mivol.transport.media.grid_integral import integrate_segment
+from mivol.transport.media.grid_extinction import GridExtinction, integrate_segment
 from mivol.transport.traversal.grid_blocks import find_block_ranges
 from mivol.transport.traversal.lattice import Lattice, clip_to_grid
 from mivol.transport.traversal.random_numbers import SpreadSampler, draw_pcg32, seed_pcg32

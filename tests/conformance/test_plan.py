@@ -16,7 +16,7 @@ from mivol.scene import plan
 from mivol.scene.needs import MediumFacts, find_needs
 from mivol.scene.plan import build_media, make_plan
 from mivol.scene.survey import survey_scene
-from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
+from mivol.transport.media.grid_extinction import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path.estimators import Settings
 from scenes import sky
 

@@ -22,7 +22,7 @@ from mivol.fields import voxels
 from mivol.fields.bricks import Bricks
 from mivol.files import SparseVolumeData, check_bricks, write_volume
 from mivol.scene_graph import find_children
-from mivol.transport.media.grid_integral import integrate_tau
+from mivol.transport.media.grid_extinction import integrate_tau
 from mivol.transport.traversal.lattice import Lattice
 from scenes import FRAMES, box_of, medium, random_rays, sky
 

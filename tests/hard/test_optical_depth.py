@@ -50,7 +50,7 @@ def test_segments_within_one_cell():
 
 
 def test_inactive_and_broken_rays():
-    from mivol.transport.media.grid_integral import integrate_tau
+    from mivol.transport.media.grid_extinction import integrate_tau
 
     lattice = make_lattice(np.ones((4, 4, 4)), np.eye(4))
     o, d = np.tile([0.5, 0.5, -1.0], (4, 1)), np.tile([0.0, 0, 1], (4, 1))

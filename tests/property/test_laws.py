@@ -55,7 +55,7 @@ def test_linear_in_sigma(seed, name):
 
 def test_width_one_broadcasts(seed):
     # One ray against many ends: lanes of width 1 mean the same for all.
-    from mivol.transport.media.grid_integral import integrate_tau
+    from mivol.transport.media.grid_extinction import integrate_tau
     from scenes import make_lattice
 
     lattice = make_lattice(np.ones((3, 3, 3)), np.eye(4))

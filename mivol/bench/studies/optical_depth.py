@@ -42,7 +42,7 @@ from mivol.bench.scenes import (
     threads_in_space,
 )
 from mivol.report.figures import Series, plot_error_against_time
-from mivol.transport.media.grid_integral import NodeGradient, backproject_segment, integrate_tau
+from mivol.transport.media.grid_extinction import NodeGradient, backproject_segment, integrate_tau
 from mivol.transport.traversal.grid_blocks import bound_blocks
 from mivol.transport.traversal.grid_walk import walk_cells
 from mivol.transport.traversal.lattice import Lattice, clip_to_grid

@@ -58,7 +58,7 @@ from mivol.optim.scenes.views import View
 from mivol.scene.plan import find_skipping
 from mivol.scene_graph import find_children
 from mivol.threads import run_child
-from mivol.transport.media.grid_integral import integrate_tau
+from mivol.transport.media.grid_extinction import integrate_tau
 from mivol.transport.traversal.grid_blocks import (
     bound_blocks,
     find_distances_of_bounds,

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.fields.bricks import ABSENT, BITS, EDGE, Bricks
-from mivol.files.sparse_volume import VOXELS
+from mivol.files.volume import VOXELS
 
 __all__ = ["mean_of_bricks", "occupied_blocks", "range_of_bricks"]
 

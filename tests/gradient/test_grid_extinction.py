@@ -38,7 +38,7 @@ BOUND = 2e-6
 
 def integrate(values, to_world, o, d, t_max=math.inf, skip=False):
     """The optical depth of tensors, with derivatives."""
-    from mivol.transport.media.grid_integral import integrate_tau
+    from mivol.transport.media.grid_extinction import integrate_tau
 
     ends = mi.Float(np.broadcast_to(np.float32(t_max), len(o)).copy())
     return integrate_tau(make_lattice(values, to_world, skip), *to_lanes(o, d), ends, mi.Bool(True))
@@ -152,7 +152,7 @@ def test_a_detached_grid_asks_for_no_gradient(seed):
 
 
 def test_inactive_lanes_receive_and_give_nothing(seed):
-    from mivol.transport.media.grid_integral import integrate_tau
+    from mivol.transport.media.grid_extinction import integrate_tau
 
     _, values, to_world, o, d = setting(seed, "unit", 1, n=64)
     v = tensor(values)
@@ -187,7 +187,7 @@ def test_a_million_rays_into_few_voxels(seed, shape):
 def test_rays_with_gradients_are_refused(seed):
     _, values, to_world, o, d = setting(seed, "unit", 1, n=4)
     lattice, (p, w) = make_lattice(values, to_world), to_lanes(o, d)
-    from mivol.transport.media.grid_integral import integrate_tau
+    from mivol.transport.media.grid_extinction import integrate_tau
 
     for attached in (p, w):
         dr.enable_grad(attached)
@@ -211,12 +211,12 @@ def test_gradients_are_packed_up_to_a_size(variant_rgb, monkeypatch, spare, rays
     """Packed gradients hold the 8 corners of a cell side by side; larger gradients, and gradients of few rays, hold a number a
     node, on every back end. A face has (4 5 6)^(2/3) = 24.3 cells.
     """
-    from mivol.transport.media import grid_integral
+    from mivol.transport.media import grid_extinction
 
     lattice = make_lattice(np.ones((3, 4, 5, 2), np.float32), FRAMES["unit"], False)
-    monkeypatch.setattr(grid_integral, "PACKED_LIMIT", grid_integral.gradient_bytes(lattice.res, 2) + spare)
-    monkeypatch.setattr(grid_integral, "FEW_RAYS", 4 / 24.3)
-    found = grid_integral.NodeGradient.zeros(lattice, rays)
+    monkeypatch.setattr(grid_extinction, "PACKED_LIMIT", grid_extinction.gradient_bytes(lattice.res, 2) + spare)
+    monkeypatch.setattr(grid_extinction, "FEW_RAYS", 4 / 24.3)
+    found = grid_extinction.NodeGradient.zeros(lattice, rays)
     packed = spare == 0 and rays == 5 and "llvm" in variant_rgb
     assert (found.packed, dr.width(found.buffer)) == (packed, 8 * 4 * 5 * 6 * 2 if packed else 3 * 4 * 5 * 2)
 
@@ -224,13 +224,13 @@ def test_gradients_are_packed_up_to_a_size(variant_rgb, monkeypatch, spare, rays
 @pytest.mark.parametrize(("spp", "packs"), [(1, False), (2, True)])
 def test_the_rays_of_a_render_choose_how_a_gradient_is_added(cpu_back_end, monkeypatch, spp, packs):
     """A face of 9^2 cells has few rays up to 10.1, and a film of 3^2 pixels has 9 for each sample. Both ways agree."""
-    from mivol.transport.media import grid_integral
+    from mivol.transport.media import grid_extinction
 
     values = np.random.default_rng(3).uniform(0, 3, (8, 8, 8, 1)).astype(np.float32)
     smoke = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.8)
     scene, key = close_up({"smoke": box_of(smoke, PLACE), "sky": sky(0.7)}, res=3), "smoke.interior_medium.sigma_t.data"
-    params, made, zeros = mi.traverse(scene), [], grid_integral.NodeGradient.zeros
-    monkeypatch.setattr(grid_integral.NodeGradient, "zeros", lambda *given: made.append(zeros(*given)) or made[-1])
+    params, made, zeros = mi.traverse(scene), [], grid_extinction.NodeGradient.zeros
+    monkeypatch.setattr(grid_extinction.NodeGradient, "zeros", lambda *given: made.append(zeros(*given)) or made[-1])
 
     def gradient():
         dr.enable_grad(params[key])
@@ -240,7 +240,7 @@ def test_the_rays_of_a_render_choose_how_a_gradient_is_added(cpu_back_end, monke
 
     chosen = gradient()
     assert {each.packed for each in made} == {packs}
-    monkeypatch.setattr(grid_integral, "FEW_RAYS", math.inf if packs else 0)
+    monkeypatch.setattr(grid_extinction, "FEW_RAYS", math.inf if packs else 0)
     other = gradient()
     assert made[-1].packed != packs
     # A node gets at most 8 numbers from each of 18 rays and of a few points, in another order.
