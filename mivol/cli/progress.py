@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mivol.optim.loop import Fit
-from mivol.report.record import QUANTITIES, Quantity
+from mivol.report.record import QUANTITIES, Quantity, join_channels
 
 T = TypeVar("T")
 
@@ -55,8 +55,8 @@ class TerminalProgress:
 
 def figures(fit: Fit, note: str = "") -> str:
     """The newest loss and errors in words, and a note."""
-    words = [f"{QUANTITIES.get(name, Quantity(name)).label} {value:.4g}" for name, value in fit.latest_errors().items()]
-    return ", ".join([f"loss {fit.history[-1]['loss']:.4g}", *words, *filter(None, [note])])
+    errors = [(QUANTITIES.get(name, Quantity(name)).label, f"{value:.4g}", "") for name, value in fit.latest_errors().items()]
+    return ", ".join([f"loss {fit.history[-1]['loss']:.4g}", *join_channels(errors), *filter(None, [note])])
 
 
 class Display:

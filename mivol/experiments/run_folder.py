@@ -31,6 +31,7 @@ from mivol.report.record import (
     RunRecord,
     append_metrics,
     find_quantity,
+    join_channels,
     read_metrics,
     read_record,
     rewind_metrics,
@@ -181,12 +182,13 @@ class RunFolder:
 
     def summary(self) -> str:
         """Return the results of the record and the time of its stages in a line."""
-        words = []
+        results = []
         for name, value in self.record.results.items():
             quantity = find_quantity(name, self.record.units)
             if value is not None:
                 figure = f"{value:.0f}" if float(value).is_integer() else f"{value:.4g}"
-                words.append(f"{quantity.label} {figure} {quantity.symbol}".rstrip())
+                results.append((quantity.label, figure, quantity.symbol))
+        words = join_channels(results)
         times = ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in self.record.timings.items())
         return f"saved: {', '.join(words)}" + (f" ({times})" if times else "")
 

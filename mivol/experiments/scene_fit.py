@@ -49,7 +49,7 @@ from mivol.files import write_exr, write_png, write_volume
 from mivol.optim.events import upsample
 from mivol.optim.loop import Course, Fit
 from mivol.optim.optimizer import Optimizer
-from mivol.optim.parameters import GRID, check_names, find_quantity
+from mivol.optim.parameters import GRID, check_names, find_parameter_kind
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import FINAL, HELD_OUT, RenderBatch, View, derive_seed, make_batches
 from mivol.report.cameras import draw_view_cameras
@@ -441,7 +441,7 @@ class SceneOutputs:
         if self.truth is not None and self.settings.truth.key == parameter.key:
             grids["truth"] = self.truth
         volumes = []
-        unit = parameter.unit or find_quantity(parameter.key).unit
+        unit = parameter.unit or find_parameter_kind(parameter.key).unit
         for role, grid in grids.items():
             stem = f"volumes/{parameter.key.replace('.', '_')}_{role}"
             write_volume(self.run.path / f"{stem}.vol", grid, place if is_along_axes else np.eye(4))

@@ -111,7 +111,7 @@ MAPS: dict[str, Map] = {
 }
 
 
-class Quantity(NamedTuple):
+class ParameterKind(NamedTuple):
     """What a parameter is: the unit of its values, and the closed domain (low, high) that makes sense of them."""
 
     unit: str
@@ -120,30 +120,30 @@ class Quantity(NamedTuple):
 
 NOT_NEGATIVE, SHARE, ANY = (0.0, math.inf), (0.0, 1.0), (-math.inf, math.inf)
 
-QUANTITIES = {
-    "sigma_t": Quantity("1/length", NOT_NEGATIVE),
-    "sigma_a": Quantity("1/length", NOT_NEGATIVE),
-    "sigma_s": Quantity("1/length", NOT_NEGATIVE),
-    "g": Quantity("1", (-0.999, 0.999)),  # at -1 and 1 a phase function is a delta function
-    "position": Quantity("length", ANY),
-    "radiance": Quantity("radiance", NOT_NEGATIVE),
-    "irradiance": Quantity("radiance sr", NOT_NEGATIVE),
-    "intensity": Quantity("radiance length²", NOT_NEGATIVE),
-    "scale": Quantity("1", NOT_NEGATIVE),
-    "data": Quantity("", NOT_NEGATIVE),
-    **dict.fromkeys(("albedo", "reflectance", "alpha", "base_color", "roughness", "metallic"), Quantity("1", SHARE)),
-    **dict.fromkeys(("diffuse_reflectance", "specular_reflectance", "specular_transmittance"), Quantity("1", SHARE)),
+PARAMETER_KINDS = {
+    "sigma_t": ParameterKind("1/length", NOT_NEGATIVE),
+    "sigma_a": ParameterKind("1/length", NOT_NEGATIVE),
+    "sigma_s": ParameterKind("1/length", NOT_NEGATIVE),
+    "g": ParameterKind("1", (-0.999, 0.999)),  # at -1 and 1 a phase function is a delta function
+    "position": ParameterKind("length", ANY),
+    "radiance": ParameterKind("radiance", NOT_NEGATIVE),
+    "irradiance": ParameterKind("radiance sr", NOT_NEGATIVE),
+    "intensity": ParameterKind("radiance length²", NOT_NEGATIVE),
+    "scale": ParameterKind("1", NOT_NEGATIVE),
+    "data": ParameterKind("", NOT_NEGATIVE),
+    **dict.fromkeys(("albedo", "reflectance", "alpha", "base_color", "roughness", "metallic"), ParameterKind("1", SHARE)),
+    **dict.fromkeys(("diffuse_reflectance", "specular_reflectance", "specular_transmittance"), ParameterKind("1", SHARE)),
 }
-"""Quantities by the last word of a key. Mitsuba's extinction is ``scale`` times ``sigma_t``, its sky ``scale`` times ``data``:
+"""Kinds by the last word of a key. Mitsuba's extinction is ``scale`` times ``sigma_t``, its sky ``scale`` times ``data``:
 only one factor has the unit."""
 
 
-def find_quantity(key: str) -> Quantity:
-    """The quantity of a key: of its last word, or of the word before ``data`` and ``value``; else any number without a unit."""
+def find_parameter_kind(key: str) -> ParameterKind:
+    """The kind of a key: of its last word, or of the word before ``data`` and ``value``; else any number without a unit."""
     words = key.split(".")
-    while len(words) > 1 and words[-1] in ("data", "value") and words[-2] in {*QUANTITIES, "value"}:
+    while len(words) > 1 and words[-1] in ("data", "value") and words[-2] in {*PARAMETER_KINDS, "value"}:
         words.pop()
-    return QUANTITIES.get(words[-1], Quantity("", ANY))
+    return PARAMETER_KINDS.get(words[-1], ParameterKind("", ANY))
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ class Parameter:
     priors: tuple[Prior, ...] = ()
 
     def __post_init__(self) -> None:
-        usual = find_quantity(self.name)
+        usual = find_parameter_kind(self.name)
         object.__setattr__(self, "unit", self.unit or usual.unit)
         object.__setattr__(self, "domain", usual.domain if self.domain is None else self.domain)
         low, high = self.domain

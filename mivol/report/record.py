@@ -15,7 +15,7 @@ import json
 import math
 import platform
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path, PurePosixPath
@@ -103,6 +103,14 @@ def find_quantity(name: str, units: Mapping[str, str]) -> Quantity:
     if known is None:
         return Quantity(name, units[name], log=False) if name in units else Quantity(name.replace("_", " "))
     return known._replace(unit=units.get(name, known.unit))
+
+
+def join_channels(numbers: Iterable[tuple[str, str, str]]) -> list[str]:
+    """Write numbers (label, figure, symbol of the unit). Channels of a parameter (``label[0]``, ``label[1]``) are one group."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for label, figure, symbol in numbers:
+        groups.setdefault((re.sub(r"\[\d+\]$", "", label), symbol), []).append(figure)
+    return [f"{label} {' '.join(figures)} {symbol}".rstrip() for (label, symbol), figures in groups.items()]
 
 
 class _Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):

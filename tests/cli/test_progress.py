@@ -42,6 +42,12 @@ def test_the_newest_numbers_in_words() -> None:
     assert progress.figures(fit_at(1, 0.123456)) == "loss 0.1235, PSNR of the fitted views 20.12, mine 0.5"
 
 
+def test_channels_of_a_parameter_are_one_group() -> None:
+    fit = fit_at(1, 0.5)
+    fit.latest_errors = lambda: {"paint[0]": 0.7, "paint[1]": 0.3, "lamp.position[0]": -1.0}
+    assert progress.figures(fit) == "loss 0.5, paint 0.7 0.3, lamp.position -1"
+
+
 def test_lines_are_said_as_they_are(output: tuple) -> None:
     written, *_ = output
     progress.TerminalProgress().say(["[bold] 1 2 3", "x" * 150])

@@ -19,7 +19,7 @@ from mivol.optim.parameters import (
     Parameter,
     as_tensor,
     find,
-    find_quantity,
+    find_parameter_kind,
     inverse_softplus,
     like,
     softplus,
@@ -141,7 +141,7 @@ def test_an_object_without_an_id_is_asked_for_one(variant_rgb) -> None:
 )
 def test_a_key_tells_its_unit_and_domain(key: str, unit: str, domain: tuple[float, float]) -> None:
     """By its last word that says something; what is given goes before."""
-    assert find_quantity(key) == (unit, domain)
+    assert find_parameter_kind(key) == (unit, domain)
     assert (Parameter(key).unit, Parameter(key).domain) == (unit, domain)
     given = Parameter(key, "1/m", (-2.0, 3.0))
     assert (given.unit, given.domain) == ("1/m", (-2.0, 3.0))
