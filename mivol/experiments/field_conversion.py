@@ -286,7 +286,7 @@ def convert_to_gaussians(path: Path, target: Path, resolution: int | None, varia
             resolution = -(-max(grid.res) // 4)
         made = grid_to_gaussians(grid, resolution)
     write_gaussians(target, made, source.view)
-    return "\n".join([f"{target}: {made.count} Gaussians of degree {made.degree}", describe_loss(path, source, target)])
+    return "\n".join([f"{target}: {made.count} Gaussians", describe_loss(path, source, target)])
 
 
 # -- Networks ---------------------------------------------------------------------------------------------------------------

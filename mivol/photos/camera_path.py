@@ -155,7 +155,7 @@ HOME_NUMBERS = 12
 
 @dataclass(frozen=True)
 class HomeView:
-    """The first view of a model fitted to photographs: upright, from the place of a photograph, at the middle of the box.
+    """The first view of a model fitted to photographs: upright, from the place of a photograph, along its view.
 
     Attributes:
         up: upward direction (3,) of the photographs.

@@ -146,14 +146,14 @@ def viewing_distance(cameras: Sequence[Camera], box: np.ndarray) -> float:
 def find_subject(cameras: Sequence[Camera], box: np.ndarray) -> np.ndarray:
     """Return the point (3,) at which pictures of the whole should aim [length].
 
-    That is the middle of the box (2, 3). If half of the cameras stand inside, as in a room, it is their focus, as long as half
-    of them see it.
+    That is the middle of the box (2, 3). The points of a room, or of the floor under a table, lie all around, so the middle of
+    their box may be anywhere: if half its longest edge exceeds the median distance of the cameras from their focus, it is
+    the focus, as long as half of the cameras see it.
     """
     middle, focus = np.mean(box, axis=0), _nearest_point(cameras)
-    inside = np.array([(box[0] <= camera.origin).all() and (camera.origin <= box[1]).all() for camera in cameras])
-    if focus is None or inside.mean() < 0.5 or count_views(cameras, focus[None])[0] < 0.5 * len(cameras):
+    if focus is None or (box[1] - box[0]).max() / 2 < median_distance(cameras, focus):
         return middle
-    return focus
+    return focus if count_views(cameras, focus[None])[0] >= 0.5 * len(cameras) else middle
 
 
 def near_and_far(cameras: Sequence[Camera], box: np.ndarray) -> tuple[float, float]:

@@ -368,7 +368,7 @@ def _leave_out(gaussians: Gaussians, degree: int, suffix: str) -> Gaussians:
     """The Gaussians with harmonics up to a degree; a warning if that leaves some out."""
     if gaussians.degree <= degree:
         return gaussians
-    text = f"a {suffix} holds harmonics up to degree {degree}: those of degree {degree + 1} to {gaussians.degree} are left out."
+    text = f"a {suffix} holds harmonics up to degree {degree}: the higher ones, up to degree {gaussians.degree}, are left out."
     warnings.warn(text, MivolWarning, stacklevel=4)
     return gaussians.with_degree(degree)
 

@@ -360,11 +360,11 @@ def write_gaussian_page(file: BinaryIO, gaussians: Gaussians, view: HomeView | N
         view: first view; None: a view of everything.
 
     Raises:
-        MivolError: no Gaussians, or more than ``MOST``.
+        MivolError: more than ``MOST``.
     """
-    if not 0 < gaussians.count <= MOST:
+    if gaussians.count > MOST:
         way_out = "remove faint ones, or write a .sog for a larger viewer"
-        raise refusal("a page", f"{gaussians.count} Gaussians", f"1 to {MOST}", way_out)
+        raise refusal("a page", f"{gaussians.count} Gaussians", f"at most {MOST}", way_out)
     unit = gaussians.quaternions / np.linalg.norm(gaussians.quaternions, axis=1, keepdims=True)
     scales, scale_ends = _to_steps(gaussians.log_scales)
     colours, colour_ends = _to_steps(gaussians.harmonics[:, 0])
@@ -470,13 +470,16 @@ def write_gaussians(path: str | os.PathLike, gaussians: Gaussians, view: HomeVie
         view: first view; a ``.ply`` keeps it as a comment, a ``.html`` begins with it, other formats leave it out.
 
     Raises:
-        MivolError: an unknown suffix, numbers that no renderer can draw, or a full disk.
+        MivolError: an unknown suffix, no Gaussians for a format other than ``.ply``, numbers that no renderer can draw, or a
+            full disk.
     """
     path = Path(path)
     writer = select_by_suffix(path, GAUSSIAN_WRITERS)
     if path.name.lower().endswith(".compressed.ply"):
         raise refusal(path, "a name for PlayCanvas' compressed .ply, which is read only", "another", "write a .sog or an .spz")
     gaussians.check(path)
+    if not gaussians.count and writer is not write_gaussian_ply:
+        raise refusal(path, "no Gaussians", "at least one", "write a .ply, or choose another file")
     if view is not None and writer is write_gaussian_page:
         writer = partial(write_gaussian_page, view=view)
     if view is not None and writer is write_gaussian_ply:

@@ -52,13 +52,7 @@ LARGEST_IMAGE = 16384
 
 
 def write_sog(file: BinaryIO, gaussians: Gaussians) -> None:
-    """Write Gaussians along a curve through space, which compresses best (Morton 1966).
-
-    Raises:
-        MivolError: no Gaussians.
-    """
-    if not gaussians.count:
-        raise refusal("a .sog", "no Gaussians", "at least one", "write a .ply")
+    """Write Gaussians along a curve through space, which compresses best (Morton 1966)."""
     sorted_ones = gaussians.select(morton_order(gaussians.means))
     meta: dict[str, Any] = {"version": VERSION, "asset": {"generator": "mivol"}, "count": gaussians.count, "antialias": False}
     images: dict[str, np.ndarray] = {}

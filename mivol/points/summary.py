@@ -103,7 +103,7 @@ def convert_file(source: Path, target: Path, kind: str | None, box: Sequence[flo
     if kind == "gaussians":
         gaussians = points_to_gaussians(contents) if isinstance(contents, PointCloud) else contents
         write_gaussians(target, gaussians, read_gaussian_view(source))
-        return f"{target}: {gaussians.count} Gaussians of degree {gaussians.degree}"
+        return f"{target}: {gaussians.count} Gaussians"
     cloud = contents if isinstance(contents, PointCloud) else gaussians_to_points(contents)
     write_points(target, cloud)
     return f"{target}: {cloud.count} points"

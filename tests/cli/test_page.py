@@ -168,7 +168,7 @@ def test_small_held_out_views_are_scrollable(tmp_path):
     results = {"held_out_psnr": 24.0, "psnr_colour_fitted": 25.0}
     page = page_of(tmp_path, "Views", images=images, judged="3 views at 2 x 2 pixels", results=results)
     text = page.text.replace("\u00a0", " ").replace("\u2011", "-")
-    assert "The other 2 held-out views" in text and text.count("of one") == 2 and text.count("of two") == 1
+    assert "2 more held-out views" in text and text.count("of one") == 2 and text.count("of two") == 1
     assert "24.0 dB PSNR on held-out views (3 views at 2 x 2 pixels; 25.0 dB after colour correction)" in text
     assert "PSNR, held-out views: 3 views at 2 x 2 pixels" in text
 

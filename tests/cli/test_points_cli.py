@@ -19,7 +19,7 @@ def test_convert_writes_what_was_read(tmp_path: Path, capsys: pytest.CaptureFixt
     """An SPZ becomes the authors' PLY, and that one points; the numbers are those that were read."""
     (tmp_path / "a.spz").write_bytes(spz_bytes(random_gaussians(9, 1), 3))
     assert main(["convert", str(tmp_path / "a.spz"), str(tmp_path / "b.ply")]) == 0
-    assert capsys.readouterr().out == f"{tmp_path / 'b.ply'}: 9 Gaussians of degree 1\n"
+    assert capsys.readouterr().out == f"{tmp_path / 'b.ply'}: 9 Gaussians\n"
     one, other = read_gaussians(tmp_path / "a.spz"), read_gaussians(tmp_path / "b.ply")
     assert all(np.array_equal(getattr(one, name), getattr(other, name)) for name in vars(one))
     assert main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "c.npy")]) == 0
@@ -131,7 +131,7 @@ def test_convert_makes_gaussians_of_a_field_and_says_their_loss(tmp_path: Path, 
         written, lost = capsys.readouterr().out.splitlines()
         assert "dB between views of c.ply and b.npz: 6 views, 128 x 128 pixels each" in lost
         count[resolution], loss[resolution] = read_gaussians(tmp_path / "c.ply").count, float(lost.split()[0])
-        assert f"c.ply: {count[resolution]} Gaussians of degree 0" in written
+        assert f"c.ply: {count[resolution]} Gaussians" in written
     assert count[12] > 4 * count[4] and loss[12] > loss[4] + 3
 
 

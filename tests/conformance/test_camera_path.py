@@ -45,10 +45,11 @@ def test_turntable_around_a_ring_is_the_ring(middle: tuple[float, ...]) -> None:
         np.testing.assert_allclose(project(camera, np.array(middle, float))[0], (32, 24), atol=1e-12)
 
 
-def test_in_a_room_films_and_first_views_aim_at_the_focus() -> None:
-    """A room's box holds the cameras, and its middle may lie anywhere; a box that cameras stand around is looked at itself."""
-    cameras, room = cameras_of(ring(12)), np.array([[-9.0, -5, -3], [5, 9, 20]])
-    for camera in turntable(cameras, room, 5):
+def test_in_a_room_or_above_a_floor_films_and_first_views_aim_at_the_focus() -> None:
+    """The middle of a room's box may lie anywhere, as of a table's and its floor, above which the cameras stand; a box that
+    cameras stand around is looked at itself."""
+    cameras, room, floor = cameras_of(ring(12)), np.array([[-9.0, -5, -3], [5, 9, 20]]), np.array([[-9.0, -5, -3], [5, 9, 0.5]])
+    for camera in turntable(cameras, room, 5) + turntable(cameras, floor, 5):
         np.testing.assert_allclose(project(camera, np.zeros(3))[0], (32, 24), atol=1e-12)
     np.testing.assert_allclose(find_home_view(cameras, room).target, 0, atol=1e-12)
     small = np.array([[0.0, 0, 0], [2, 1, 1]])
