@@ -2,7 +2,7 @@
 
 Conventions. A place in the tree is a dotted key; entries of lists count from 0. If a setting has several possible structs,
 their tag tells which. msgspec checks types and domains; this module adds the nearest valid name, and refuses infinite numbers
-for settings without an infinite default.
+for settings without an infinite default, except those that a struct names in ``may_be_infinite``.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ def check_keys(raw: Any, kind: Any, where: str, name: str) -> None:
             dotted, words = f"{where}.{key}".lstrip("."), words_in(hints[key])
             if isinstance(value, str) and words and value not in words:
                 raise MivolError(f'{name}: {dotted} = "{value}" is unknown: {suggest_name(value, list(words))}')
-            if _is_infinite(value) and not _is_infinite(fields[key].default):
+            may_be = _is_infinite(fields[key].default) or key in getattr(struct, "may_be_infinite", ())
+            if _is_infinite(value) and not may_be:
                 raise MivolError(f"{name}: {dotted} = {value}: expected a finite number.")
             check_keys(value, hints[key], dotted, name)
 

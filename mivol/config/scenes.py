@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from mivol.optim.events import EVENTS, Checkpoint, Evaluate
 from mivol.optim.first_order import Adam
@@ -72,6 +72,8 @@ class Files(Section, tag_field="source", tag="files"):
 
 class Sought(Section):
     """A parameter to fit."""
+
+    may_be_infinite: ClassVar[tuple[str, ...]] = ("domain",)
 
     key: Annotated[str, setting("1", "key of mi.traverse(scene)", min_length=1)]
     unit: Annotated[str, setting("1", "unit of the value; empty: the usual unit of the key")] = ""

@@ -36,7 +36,7 @@ def raw() -> dict:
 def test_defaults_and_given_values() -> None:
     found = config.from_dict(raw())
     assert found.parameter[0].prior == (TotalVariation(weight=0.5),)
-    assert found.parameter[0].domain == (0.0, math.inf)
+    assert found.parameter[0].domain is None
     assert found.views.count == 8
     assert found.fit.integrator == "mivol"
 
@@ -65,6 +65,7 @@ def test_command_line_overrides_the_file(tmp_path: Path) -> None:
     assert found.optimizer == GaussNewton(inner=4)
     assert found.title == "two words"
     assert found.parameter[0].prior[0].weight == 2.0
+    assert config.load(path, ["parameter.0.domain=[0, inf]"]).parameter[0].domain == (0.0, math.inf)
 
 
 def test_flat_names_everything_that_changes_the_result() -> None:
