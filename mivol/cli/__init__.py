@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import errno
 import os
+import select
 import shlex
 import sys
 import warnings
@@ -70,14 +71,21 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _is_output_closed() -> bool:
-    """Whether the reader of the output has gone, as in ``mivol explain scene.xml | head``; then the output goes nowhere."""
+    """Whether the reader of the output has gone, as in ``mivol explain scene.xml | head``; then the output goes nowhere.
+
+    A text longer than Python's buffer is lost at its first write, so a further flush tells nothing, and the system is asked.
+    """
     try:
         sys.stdout.flush()
+        pipe = select.poll()
+        pipe.register(sys.stdout.fileno(), 0)
+        is_closed = bool(pipe.poll(0))
     except BrokenPipeError:
+        is_closed = True
+    if is_closed:
         # Python flushes once more at its end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return True
-    return False
+    return is_closed
 
 
 def describe_error(error: MivolError | OSError | MemoryError) -> str:

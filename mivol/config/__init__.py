@@ -124,7 +124,7 @@ def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment:
             raise RecursionError
         raw = tomllib.loads(text)
     except FileNotFoundError:
-        raise MivolError(f"found no file {path}: give the path of an experiment in TOML.") from None
+        raise MivolError(f"found no file {path}: give the path of an experiment, a scan or photographs.") from None
     except RecursionError:
         raise MivolError(f"{path} nests its values deeper than an experiment does: close its brackets.") from None
     except (ValueError, IsADirectoryError) as error:  # of TOML, of UTF-8, and of numbers of thousands of digits

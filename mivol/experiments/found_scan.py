@@ -478,6 +478,7 @@ def _has_reading(given: dict[str, Any]) -> bool:
 
 def _draft_angles(folder: Path, scan: dict[str, Any], data: dict[str, Any], views: int, three: np.ndarray) -> list[str]:
     """Put a file of angles, or an arc, into the settings; return lines."""
+    others = []
     for file in sorted(folder.iterdir(), key=natural_order):
         if file.suffix.lower() not in ANGLE_FILES:
             continue
@@ -489,9 +490,11 @@ def _draft_angles(folder: Path, scan: dict[str, Any], data: dict[str, Any], view
             unit = "radian" if half_turns_in_radians(angles) else "degree"
             data |= {"angles": str(file), "angle_unit": unit}
             return [f"found: {file.name}: angles from {angles[0]:.4g} to {angles[-1]:.4g}, taken as {unit}s by their arc"]
+        others.append(f"{file.name} has {len(angles)}")
     arc, why = guess_arc(three)
     scan["arc"] = arc
-    lead = f"assumed: no file with {views} angles: views evenly over {arc:g} degrees, because"
+    told = f" ({', '.join(others)})" if others else ""
+    lead = f"assumed: no file with {views} angles{told}: views evenly over {arc:g} degrees, because"
     return [f"{lead} {why}; scan.arc sets it"]
 
 

@@ -381,7 +381,8 @@ def load_scene(source: SceneSource | mi.Scene, overrides: Mapping[str, object] |
 
 def _load_file(path: Path, overrides: dict[str, str]) -> LoadedScene:
     if not path.is_file():
-        raise MivolError(f"there is no scene file {path}; give the path of a Mitsuba XML file.")
+        expected = "of a Mitsuba XML file" if path.suffix.lower() == ".xml" else "of a scene, a volume, a scan or photographs"
+        raise MivolError(f"there is no scene file {path}; give the path {expected}.")
     with resolve_beside(path):
         state = parse_file(path, overrides)
         files = tuple(dict.fromkeys([*(Path(str(f)) for f in state.files), *find_named_files(state)]))

@@ -213,8 +213,16 @@ def test_wrong_arguments_end_with_2(capsys: pytest.CaptureFixture) -> None:
         assert done.value.code == 2
 
 
-def test_a_reader_that_has_gone_ends_quietly(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As in ``mivol bench | head -1``: no message and no traceback, also when Python flushes the output at its end."""
+@pytest.mark.parametrize("length", [10, 100_000])
+def test_a_reader_that_has_gone_ends_quietly(capsys: pytest.CaptureFixture, monkeypatch, length: int) -> None:
+    """As in ``mivol bench | head -1``: no message and no traceback, also when Python flushes the output at its end, and for a
+    text that does not fit into Python's buffer."""
+
+    def answer(arguments: object) -> None:
+        """Print a text."""
+        print("x" * length)
+
+    monkeypatch.setitem(VERBS, "bench", VERBS["bench"]._replace(run=answer))
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, "w") as output:

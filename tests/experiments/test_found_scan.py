@@ -94,6 +94,8 @@ def test_a_folder_of_images(tmp_path: Path) -> None:
     }
     assert draft.raw["scan"] == {"beam": "parallel", "arc": 180.0} and "held_out_every" not in draft.raw
     assert any("preview.tif: not used" in line for line in draft.lines)
+    (folder / "theta.txt").write_text("\n".join(map(str, np.linspace(0, np.pi, 16)[:13])))
+    assert any("no file with 12 angles (theta.txt has 13)" in line for line in draft_scan(folder).lines)
     (folder / "theta.txt").write_text("\n".join(map(str, np.linspace(0, np.pi, 16)[:12])))
     assert draft_scan(folder).raw["data"]["angle_unit"] == "degree"
     for name in ("proj", "Flats", "dark_field"):
