@@ -162,6 +162,6 @@ def _miepython() -> ModuleType:
         import miepython
     except ImportError as error:
         raise MivolError(
-            f'Mie phase functions need miepython, which cannot be imported ({error}): pip install "mivol[mie]"'
+            f'Mie phase functions need miepython, which cannot be imported ({error}): pip install "mivol[mie]".'
         ) from error
     return miepython

@@ -59,6 +59,12 @@ def describe_error(error: Exception) -> str:
     return text if len(text) <= MAX_REASON_LENGTH else f"{text[:MAX_REASON_LENGTH]} ..."
 
 
+def quote_at_end(error: Exception) -> str:
+    """The words of an error of Mitsuba as the end of a sentence."""
+    said = describe_error(error)
+    return said if said.endswith(".") else f"{said.rstrip('!')}."
+
+
 @contextmanager
 def resolve_beside(path: Path) -> Iterator[None]:
     """Search for files beside the XML inside a ``with`` block, and drop the XML's ``<path>`` elements afterwards."""
@@ -86,7 +92,7 @@ def parse_file(path: Path, overrides: dict[str, str]) -> Any:
     except RuntimeError as error:
         if "unused parameters" in str(error):
             raise MivolError(_describe_unused_override(path, overrides, str(error))) from None
-        raise MivolError(f"{path} cannot be read: {describe_error(error)}") from error
+        raise MivolError(f"{path} cannot be read: {quote_at_end(error)}") from error
     return _resolve(parser, config, state, path)
 
 
@@ -102,7 +108,7 @@ def parse_dict(source: dict) -> Any:
     try:
         state = parser.parse_dict(config, source)
     except RuntimeError as error:
-        raise MivolError(f"the scene dict cannot be read: {describe_error(error)}") from error
+        raise MivolError(f"the scene dict cannot be read: {quote_at_end(error)}") from error
     return _resolve(parser, config, state, "the scene dict")
 
 
@@ -111,7 +117,7 @@ def _resolve(parser: Any, config: Any, state: Any, origin: Any) -> Any:
         parser.transform_upgrade(config, state)
         parser.transform_resolve(config, state)
     except RuntimeError as error:
-        raise MivolError(f"{origin} cannot be read: {describe_error(error)}") from error
+        raise MivolError(f"{origin} cannot be read: {quote_at_end(error)}") from error
     return state
 
 
@@ -392,7 +398,7 @@ def _load_file(path: Path, overrides: dict[str, str]) -> LoadedScene:
         with ensure_two_threads():
             scene = mi.load_file(str(path), parallel=False, **overrides)
     except RuntimeError as error:
-        raise MivolError(f"{path} cannot be loaded: {describe_error(error)}") from error
+        raise MivolError(f"{path} cannot be loaded: {quote_at_end(error)}") from error
     return LoadedScene(_check_scene(scene, path), path.stem, "file", files, digest, obstacle)
 
 
@@ -404,7 +410,7 @@ def _load_dict(source: dict) -> LoadedScene:
         with ensure_two_threads():
             scene = mi.load_dict(source, parallel=False)
     except RuntimeError as error:
-        raise MivolError(f"the scene dict cannot be loaded: {describe_error(error)}") from error
+        raise MivolError(f"the scene dict cannot be loaded: {quote_at_end(error)}") from error
     return LoadedScene(_check_scene(scene, "the dict"), "scene", "dict", files, digest, obstacle)
 
 

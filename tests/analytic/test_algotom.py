@@ -7,6 +7,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 import mivol
 from mivol.errors import MivolError
@@ -63,8 +64,7 @@ def test_what_a_method_gets(stand_in: None) -> None:
     ],
 )
 def test_one_sentence(stand_in: None, method: str, y: np.ndarray, options: dict, found: str) -> None:
-    with pytest.raises(MivolError, match=found):
-        mivol.run_algotom(method, y, **options)
+    assert_refused(found, mivol.run_algotom, method, y, **options)
 
 
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

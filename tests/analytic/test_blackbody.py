@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 from scipy.constants import Boltzmann, Planck, Stefan_Boltzmann, Wien, speed_of_light
 
-from mivol.errors import MivolError
 from mivol.fields.blackbody import LUMENS_PER_WATT, blackbody_rgb, blackbody_xyz, planck
 
 TEMPERATURES = (200.0, 1000.0, 2856.0, 6500.0, 2e4)
@@ -69,5 +69,4 @@ def test_any_temperature(variant_rgb):
 
 def test_bad_temperatures():
     for bad in (-3.0, np.nan, np.inf):
-        with pytest.raises(MivolError, match="Celsius"):
-            planck(500.0, np.array([300.0, bad]))
+        assert_refused("Celsius", planck, 500.0, np.array([300.0, bad]))

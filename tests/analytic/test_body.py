@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from bounded_ball import Ball
+from refusals import assert_refused
 
-from mivol.errors import MivolError
 from mivol.transport.media.body import Body, eval_albedo, flight_parts, is_followed, medium_interaction
 from mivol.transport.media.extinction import BoundedExtinction, ConstantExtinction, RayInterval
 from mivol.transport.media.grid_extinction import GridExtinction
@@ -83,8 +83,7 @@ def test_optical_depth_is_the_sum_of_the_parts_times_the_scale():
 def test_the_optical_depth_of_a_bounded_field_is_refused():
     body = body_of(bounded(), constant(0.5))
     assert body.is_bounded and not body_of(grid()).is_bounded
-    with pytest.raises(MivolError, match="its transmittance instead"):
-        body.optical_depth(inside(), 1)
+    assert_refused("its transmittance instead", body.optical_depth, inside(), 1)
     assert values(body.optical_depth(inside(), 1, body.exact_parts)) == [1.0]
 
 

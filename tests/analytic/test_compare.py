@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from mivol.errors import MivolError
 from mivol.files import encode_srgb
@@ -116,8 +117,7 @@ def test_refusals():
         compare(Estimate(np.zeros((3, 6, 3))), reference())
     image = even(MEAN)
     image.mean[0, 0, 0] = np.nan
-    with pytest.raises(MivolError, match=r"first mean is nan at \(0, 0, 0\)"):
-        compare(image, reference())
+    assert_refused(r"first mean is nan at \(0, 0, 0\)", compare, image, reference())
 
 
 RNG = np.random.default_rng(0)
@@ -196,11 +196,9 @@ def test_scores_of_unlike_images_are_refused(monkeypatch: pytest.MonkeyPatch) ->
         "found no image to score": lambda: average_scores([]),
     }
     for message, call in cases.items():
-        with pytest.raises(MivolError, match=message):
-            call()
+        assert_refused(message, call)
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
-    with pytest.raises(MivolError, match=r"pip install .mivol.metrics"):
-        score_image(TRUTH, TRUTH, metrics=list(METRICS))
+    assert_refused(r"pip install .mivol.metrics", score_image, TRUTH, TRUTH, metrics=list(METRICS))
 
 
 def test_errors_and_similarity_by_hand():
@@ -225,8 +223,7 @@ def test_metrics_without_a_scale_are_refused():
         (lambda: ssim(one, one), "11 pixel window"),
     ]
     for call, words in cases:
-        with pytest.raises(MivolError, match=words):
-            call()
+        assert_refused(words, call)
 
 
 HOW = {"integrator": "volpath", "max_depth": 2, "channels_alone": False}

@@ -13,6 +13,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
+from refusals import assert_refused
 
 from mivol.errors import MivolError
 from mivol.files import fetch
@@ -112,8 +113,7 @@ def test_a_data_set_is_downloaded_once(server: Server, data: DataSet, tmp_path: 
 def test_an_interrupted_download_resumes(server: Server, data: DataSet, tmp_path: Path, knows_ranges: bool) -> None:
     """The second call requests the missing bytes; a server without ranges sends the whole file again."""
     server.breaks_after, server.knows_ranges = 100000, knows_ranges
-    with pytest.raises(MivolError, match="100000 of 262144 bytes; call again to resume the download"):
-        fetch_data(data, tmp_path)
+    assert_refused("100000 of 262144 bytes; call again to resume the download", fetch_data, data, tmp_path)
     assert not (tmp_path / "kind/a.vol").exists()
     server.breaks_after = None
     assert fetch_data(data, tmp_path).read_bytes() == BODY
@@ -122,11 +122,9 @@ def test_an_interrupted_download_resumes(server: Server, data: DataSet, tmp_path
 
 
 def test_a_wrong_hash_is_refused_and_deleted(server: Server, data: DataSet, tmp_path: Path) -> None:
-    with pytest.raises(MivolError, match="the download was deleted"):
-        fetch_data(replace(data, sha256="0" * 64), tmp_path)
+    assert_refused("the download was deleted", fetch_data, replace(data, sha256="0" * 64), tmp_path)
     server.body = BODY * 50
-    with pytest.raises(MivolError, match="the download was deleted"):
-        fetch_data(data, tmp_path)
+    assert_refused("the download was deleted", fetch_data, data, tmp_path)
     assert list((tmp_path / "kind").iterdir()) == []
 
 
@@ -141,10 +139,8 @@ def test_a_larger_file_does_not_fill_the_disk(server: Server, data: DataSet, tmp
 
 def test_an_unreachable_server_is_reported(server: Server, data: DataSet, tmp_path: Path) -> None:
     server.status = 404
-    with pytest.raises(MivolError, match=r"could not be fetched \(Not Found\) after 0 of"):
-        fetch_data(data, tmp_path)
-    with pytest.raises(MivolError, match="could not be fetched"):
-        fetch_data(replace(data, url="http://127.0.0.1:9/a.vol"), tmp_path)
+    assert_refused(r"could not be fetched \(Not Found\) after 0 of", fetch_data, data, tmp_path)
+    assert_refused("could not be fetched", fetch_data, replace(data, url="http://127.0.0.1:9/a.vol"), tmp_path)
 
 
 def test_a_path_may_name_a_data_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,10 +148,8 @@ def test_a_path_may_name_a_data_set(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("MIVOL_CACHE", str(tmp_path / "cache"))
     assert resolve_path(tmp_path, "a.vol") == tmp_path / "a.vol"
     assert find_local_file("smoke") is None
-    with pytest.raises(MivolError, match='"mivol fetch smoke"'):
-        resolve_path(tmp_path, "data:smoke")
-    with pytest.raises(MivolError, match='did you mean "smoke"'):
-        resolve_path(tmp_path, "data:smok")
+    assert_refused('"mivol fetch smoke"', resolve_path, tmp_path, "data:smoke")
+    assert_refused('did you mean "smoke"', resolve_path, tmp_path, "data:smok")
     for variable, folder in (("MIVOL_CACHE", "cache"), ("MIVOL_DATA", "beside")):
         monkeypatch.setenv(variable, str(tmp_path / folder))
         there = tmp_path / folder / DATA["smoke"].path

@@ -6,9 +6,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from refusals import assert_refused
 from sampled_fields import OBLONG, random_points
 
-from mivol.errors import MivolError
 from mivol.fields import hash_grid, networks
 from mivol.fields.hash_encoding import HashSizes
 from mivol.fields.hash_grid import HashField
@@ -188,13 +188,11 @@ def test_products_in_pieces_equal_whole_products() -> None:
 def test_sizes_that_contradict_are_refused(change: dict[str, int], said: str) -> None:
     from dataclasses import replace
 
-    with pytest.raises(MivolError, match=said):
-        replace(SIZES, **change)
+    assert_refused(said, replace, SIZES, **change)
 
 
 def test_tables_and_weights_of_other_sizes_are_refused(variant_rgb: str) -> None:
     field = make()
     for name in ("table", "density_weights", "colour_weights"):
         values = field.parameters() | {name: dr.zeros(mi.TensorXf, (7,))}
-        with pytest.raises(MivolError, match=f"{name} has 7 numbers, expected"):
-            field.with_parameters(values)
+        assert_refused(f"{name} has 7 numbers, expected", field.with_parameters, values)

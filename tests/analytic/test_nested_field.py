@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from oracle_radiance import NestedTwin, Twin, sh_basis
 from radiance_rays import CUBE, TO_WORLD, derive, followed, make, rays_of, see
+from refusals import assert_refused
 
-from mivol.errors import MivolError
 from mivol.fields.harmonics import local_frame
 from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
 from mivol.transport.line_integrals.radiance_field import RayGradient, find_occupied_cells, make_model, render_rays, vjp_rays
@@ -230,15 +230,12 @@ def test_near_derivatives_are_scaled_and_far_ones_are_not() -> None:
 
 def test_what_does_not_nest_is_refused() -> None:
     grid = SphericalGrid.from_dense(np.ones((4, 4, 4)), np.zeros((4, 4, 4, 1, 3)), CUBE)
-    with pytest.raises(MivolError, match=r"grid 1 of a nested field is not 2\^1 times"):
-        SphericalGrid.from_levels([grid, grid])
+    assert_refused(r"grid 1 of a nested field is not 2\^1 times", SphericalGrid.from_levels, [grid, grid])
     other = SphericalGrid.from_dense(np.ones((4, 4, 4)), np.zeros((4, 4, 4, 4, 3)), place(1, CUBE))
-    with pytest.raises(MivolError, match="another kind"):
-        SphericalGrid.from_levels([grid, other])
+    assert_refused("another kind", SphericalGrid.from_levels, [grid, other])
     values = np.ones((4, 4, 4)), np.zeros((4, 4, 4, 1, 3))
     soft = [SphericalGrid.from_dense(*values, place(i, CUBE), activation="exp") for i in (0, 1)]
-    with pytest.raises(MivolError, match="activation exp"):
-        SphericalGrid.from_levels(soft)
+    assert_refused("activation exp", SphericalGrid.from_levels, soft)
 
 
 def test_a_level_is_a_grid_again() -> None:
@@ -249,7 +246,5 @@ def test_a_level_is_a_grid_again() -> None:
         assert np.array_equal(back.to_dense()[0], np.float32(values[level][0]))
         assert np.array_equal(back.to_dense()[1], values[level][1])
         np.testing.assert_allclose(back.to_world, place(level), atol=1e-12)
-    with pytest.raises(MivolError, match="level 3 of a field of 3"):
-        field.extract_level(LEVELS)
-    with pytest.raises(MivolError, match="3 nested levels is no one grid"):
-        field.to_dense()
+    assert_refused("level 3 of a field of 3", field.extract_level, LEVELS)
+    assert_refused("3 nested levels is no one grid", field.to_dense)

@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
-import pytest
+from refusals import assert_refused
 from sampled_fields import CUBE, Cloud, Slab
 
-from mivol.errors import MivolError
 from mivol.fields.resampling import OPAQUE, sample_field
 from mivol.fields.sampled_field import Region
 
@@ -51,5 +50,4 @@ def test_unoccupied_cells_are_left_out_and_opaque_voxels_are_capped(variant_rgb:
     edge = (8 / (6 * 8 * 10)) ** (1 / 3)
     assert not density[:, :, :4].any()
     np.testing.assert_allclose(density[:, :, 5:], OPAQUE / edge, rtol=1e-6)
-    with pytest.raises(MivolError, match="no matter in the box"):
-        sample_field(replace(Slab(0.0), region=region()), RES, CUBE)
+    assert_refused("no matter in the box", sample_field, replace(Slab(0.0), region=region()), RES, CUBE)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from false_alarms import assert_rate, assert_same_variance, note
+from refusals import assert_refused
 from scipy.special import erfc, stdtr
 from scipy.stats import binom, norm
 
@@ -229,8 +230,7 @@ def test_refusals():
         (lambda: smallest_detectable_bias(1.0, power=1), "power = 1"),
     ]
     for call, words in cases:
-        with pytest.raises(MivolError, match=words):
-            call()
+        assert_refused(words, call)
 
 
 def test_moments_keep_their_digits(seed):
@@ -270,8 +270,7 @@ def test_pooled_tiles(seed):
     _, var = average_tiles(sigma, sigma**2, 2)
     assert means.shape[1:] == (2, 3, 1)
     assert_same_variance(means, var, what="tiles")
-    with pytest.raises(MivolError, match="tiles of 9 pixels"):
-        average_tiles(sigma, sigma, 9)
+    assert_refused("tiles of 9 pixels", average_tiles, sigma, sigma, 9)
 
 
 @pytest.mark.parametrize("p", [1e-4, 0.03, 0.5, 0.97])
@@ -296,10 +295,8 @@ def test_bounded_p_value_at_the_ends():
     p = bounded_p_value(np.array([0.0, 1.0, 0.1, 0.0]), 10, np.array([0.0, 1.0, 0.0, 1.0]))
     np.testing.assert_array_equal(p, [1, 1, 0, 0])
     assert bounded_p_value(3.0, 100, 3.0, (2, 7)) == 1
-    with pytest.raises(MivolError, match="outside the bounds"):
-        bounded_p_value(np.array([1.5]), 10, np.array([0.5]))
-    with pytest.raises(MivolError, match="expected the lower bound below"):
-        bounded_p_value(0.0, 10, 0.0, (1, 1))
+    assert_refused("outside the bounds", bounded_p_value, np.array([1.5]), 10, np.array([0.5]))
+    assert_refused("expected the lower bound below", bounded_p_value, 0.0, 10, 0.0, (1, 1))
 
 
 def test_unseen_transmittance_is_no_alarm():

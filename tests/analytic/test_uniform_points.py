@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from bounded_ball import Ball
+from refusals import assert_refused
 
-from mivol.errors import MivolError
 from mivol.transport.media.body import Body
 from mivol.transport.media.extinction import BoundedExtinction, RayInterval
 from mivol.transport.media.ray_intervals import (
@@ -57,8 +57,7 @@ def test_lanes_that_are_off_have_no_length():
 
 def test_a_segment_needs_a_random_number_where_something_is_bounded():
     assert start_reservoirs(0, None, 1) == []
-    with pytest.raises(MivolError, match="give RaySegment.u"):
-        start_reservoirs(1, None, 1)
+    assert_refused("give RaySegment.u", start_reservoirs, 1, None, 1)
 
 
 LOW, HIGH = (2.0, 3.0), (4.5, 4.75)

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from bench_figures import drawn
 from readable_figures import assert_readable
+from refusals import assert_refused
 
 from mivol.bench.harness.contests import Contest, Timing
 from mivol.bench.studies import everyday
 from mivol.bench.studies.everyday import SCENES, STUDY, EverydaySize, measure_gradients, measure_images
-from mivol.errors import MivolError
 
 TINY = replace(EverydaySize.quick(), scenes=("jade_null_sun",), side=2, spp=4, rounds=4)
 
@@ -86,8 +86,7 @@ def test_geometric_means_leave_out_a_scene_without_a_ratio(variant_rgb: str, mon
 
 
 def test_unknown_scenes_are_refused(variant_rgb: str) -> None:
-    with pytest.raises(MivolError, match='there is no scene "god_ray"'):
-        measure_images(replace(TINY, scenes=("god_ray",)))
+    assert_refused('there is no scene "god_ray"', measure_images, replace(TINY, scenes=("god_ray",)))
 
 
 def made_up(ratios: dict[str, float | None]) -> dict:

@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from refusals import assert_refused
 from scipy import stats
 from tiny_experiment import refused, run
 
@@ -444,8 +445,7 @@ def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert 'did you mean "depth"' in refused(capsys, "bench", "deph")
     for text in ("[1]", "{", "[" * 100000):
         (tmp_path / "old.json").write_text(text)
-        with pytest.raises(MivolError, match="not the result of a study"):
-            catalogue.read_result(tmp_path / "old.json")
+        assert_refused("not the result of a study", catalogue.read_result, tmp_path / "old.json")
 
 
 def test_the_largest_change_comes_first() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from refusals import assert_refused
 
 from mivol import config
 from mivol.errors import MivolError
@@ -125,16 +126,12 @@ def test_wrong_settings(case: str) -> None:
 
 
 def test_wrong_files(tmp_path: Path) -> None:
-    with pytest.raises(MivolError, match="found no file"):
-        config.load(tmp_path / "none.toml")
+    assert_refused("found no file", config.load, tmp_path / "none.toml")
     (tmp_path / "bad.toml").write_text("title = ")
-    with pytest.raises(MivolError, match="is not TOML"):
-        config.load(tmp_path / "bad.toml")
+    assert_refused("is not TOML", config.load, tmp_path / "bad.toml")
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(MivolError, match="is not TOML"):
-        config.load(tmp_path / "binary.toml")
-    with pytest.raises(MivolError, match="is not TOML"):
-        config.load(tmp_path)
+    assert_refused("is not TOML", config.load, tmp_path / "binary.toml")
+    assert_refused("is not TOML", config.load, tmp_path)
     (tmp_path / "scene.xml").write_text('\n<scene version="3.0.0"/>')
     with pytest.raises(MivolError, match=r"found XML, expected an experiment in TOML; name the scene in its table \[scene\]"):
         config.load(tmp_path / "scene.xml")

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 from tiny_experiment import PHOTOS, SCENE, run, write_experiment
 
 import mivol
 from mivol import config
-from mivol.errors import MivolError
 from mivol.experiments.kinds import explain_experiment
 from mivol.files import write_volume
 
@@ -53,8 +53,7 @@ def test_facts_come_before_a_refusal_of_the_numbers(variant_rgb, folder: Path, c
 def test_a_path_is_loaded_as_everywhere(variant_rgb, folder: Path) -> None:
     """What a script asks about by its path is refused in the words of the other verbs."""
     assert mivol.explain(folder / "scene.xml").startswith("facts\n")
-    with pytest.raises(MivolError, match=r"there is no scene file .*nowhere.xml"):
-        mivol.explain(folder / "nowhere.xml")
+    assert_refused(r"there is no scene file .*nowhere.xml", mivol.explain, folder / "nowhere.xml")
 
 
 def test_a_medium_behind_an_opaque_surface_is_warned_of(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from local_workers import kill_once, kill_worker, some_workers
+from refusals import assert_refused
 from tiny_experiment import PHOTOS, run, write_experiment
 
 from mivol import config
@@ -116,8 +117,7 @@ def test_references_do_not_depend_on_workers(client: object, tmp_path: Path, var
 def test_errors_of_workers_are_sentences(client: object) -> None:
     """A refusal comes as it is, a bug with its type, and the pool goes on after each."""
     with some_workers(client, 1) as pool:
-        with pytest.raises(MivolError, match="this scene is refused"):
-            list(pool.run([Unit(0, answer, (0, "refusal"))]))
+        assert_refused("this scene is refused", list, pool.run([Unit(0, answer, (0, "refusal"))]))
         with pytest.raises(ZeroDivisionError):
             list(pool.run([Unit(0, answer, (0, "bug"))]))
         assert sorted(pool.run(Unit(i, answer, (i, "")) for i in range(5))) == [(i, i) for i in range(5)]

@@ -10,12 +10,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from ball_photos import BOX, PLAN, ball, camera, photo
+from refusals import assert_refused
 
 from mivol.back_end import set_threads
 from mivol.cluster.pool import Unit
 from mivol.cluster.steps import SharedProjector, StepTimes, make_view_blocks, share_problem, share_projector
 from mivol.cluster.workplace import Workplace
-from mivol.errors import MivolError
 from mivol.fields.hash_encoding import HashSizes
 from mivol.optim.gaussians.gaussian_plan import GaussianPlan, GaussianStage
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
@@ -206,5 +206,4 @@ def test_rays_of_the_caller_are_refused(variant_rgb: str) -> None:
         """Rays of a script."""
 
     walk = Projector(Rays(np.arange(3) * 1.0, (1, 4), 0.2), VoxelGrid((1, 4, 4)))
-    with pytest.raises(MivolError, match="the rays are a Rays of this process"):
-        share_projector(PoolHere(1), walk)
+    assert_refused("the rays are a Rays of this process", share_projector, PoolHere(1), walk)

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
+from refusals import assert_refused
 from syntax import tree_of
 from tiny_experiment import refused, write_experiment
 
@@ -85,8 +86,7 @@ def test_jobs_that_could_not_be_submitted_are_collected(capsys: pytest.CaptureFi
     ],
 )
 def test_wrong_clusters_are_refused(text: str, reason: str) -> None:
-    with pytest.raises(MivolError, match=reason):
-        parse_cluster(text)
+    assert_refused(reason, parse_cluster, text)
 
 
 @pytest.mark.parametrize(
@@ -104,8 +104,7 @@ def test_wrong_clusters_are_refused(text: str, reason: str) -> None:
 )
 def test_wrong_files_are_refused(text: str, reason: str, tmp_path: Path) -> None:
     (tmp_path / "cluster.toml").write_text(text)
-    with pytest.raises(MivolError, match=reason):
-        parse_cluster(str(tmp_path / "cluster.toml"))
+    assert_refused(reason, parse_cluster, str(tmp_path / "cluster.toml"))
 
 
 def test_files_without_certificates_are_refused(tmp_path: Path) -> None:
@@ -153,16 +152,14 @@ def test_equal_workers_are_admitted() -> None:
 def test_other_software_is_refused(name: str) -> None:
     own = find_facts()
     odd = own._replace(host="node7", software=own.software | {name: "0.0"})
-    with pytest.raises(MivolError, match=f"worker tls://a:1 on node7 has {name} 0.0, and this process"):
-        check_worker("tls://a:1", odd)
+    assert_refused(f"worker tls://a:1 on node7 has {name} 0.0, and this process", check_worker, "tls://a:1", odd)
 
 
 def test_workers_that_cannot_render_are_named() -> None:
     own = find_facts()
     with pytest.raises(MivolError, match="on node7 cannot render: no LLVM; follow mivol doctor there"):
         check_worker("tls://a:1", own._replace(host="node7", fault="no LLVM."))
-    with pytest.raises(MivolError, match="2 threads of Dask.*--nthreads 1"):
-        check_worker("tls://a:1", own._replace(dask_threads=2))
+    assert_refused("2 threads of Dask.*--nthreads 1", check_worker, "tls://a:1", own._replace(dask_threads=2))
 
 
 def test_mivol_doctor_runs_on_workers_that_cannot_render(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,8 +170,7 @@ def test_mivol_doctor_runs_on_workers_that_cannot_render(monkeypatch: pytest.Mon
     assert [line.split() for line in facts.doctor] == [["FAULT", "LLVM", "none", "usable"], [">", "install", "LLVM", "20"]]
     pool, said = make_pool(0), []
     pool.say = said.append
-    with pytest.raises(MivolError, match="on node7 cannot render: no LLVM; follow"):
-        pool._admit("tls://a:1", None, facts)
+    assert_refused("on node7 cannot render: no LLVM; follow", pool._admit, "tls://a:1", None, facts)
     assert said[0].startswith("mivol doctor on node7 (tls://a:1):\nFAULT LLVM")
 
 
@@ -198,12 +194,10 @@ def test_inputs_are_counted_before_they_are_sent() -> None:
     pool = make_pool(400, 400)
     pool.share("a", None, 60)
     pool.share("a", None, 60)  # the same content again
-    with pytest.raises(MivolError, match="half of the memory of a worker on node1"):
-        pool.share("b", None, 41)
+    assert_refused("half of the memory of a worker on node1", pool.share, "b", None, 41)
     pool.forget("b")
     pool.check_room(40)
-    with pytest.raises(MivolError, match="half of the memory of a worker on node1"):
-        pool.check_room(41)
+    assert_refused("half of the memory of a worker on node1", pool.check_room, 41)
 
 
 def test_work_that_kills_its_workers_ends() -> None:
@@ -215,8 +209,7 @@ def test_work_that_kills_its_workers_ends() -> None:
     pool._lose("w0")
     pool._lose("w1")
     assert (pool.lost, pool.repeated) == (2, 2)
-    with pytest.raises(MivolError, match=r"work view 3 \(len\) ended 3 workers"):
-        pool._lose("w2")
+    assert_refused(r"work view 3 \(len\) ended 3 workers", pool._lose, "w2")
 
 
 def test_a_worker_at_the_address_of_a_lost_one_joins() -> None:
@@ -292,8 +285,7 @@ def test_sensors_cross_processes(variant_rgb: str) -> None:
     assert back["film"] == {"type": "hdrfilm", "width": 4}
     scene = mi.load_dict({"type": "scene", "a": {"type": "perspective"}, "b": {"type": "orthographic"}})
     assert [encode_sensor(scene, sensor) for sensor in scene.sensors()] == [0, 1]
-    with pytest.raises(MivolError, match="which workers do not have"):
-        encode_sensor(scene, mi.load_dict({"type": "perspective"}))
+    assert_refused("which workers do not have", encode_sensor, scene, mi.load_dict({"type": "perspective"}))
 
 
 def test_files_of_an_experiment_are_found(variant_rgb: str, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from mivol.errors import MivolError
 from mivol.scene.sensors import RIGS, Hemisphere, LookAts, Ring, SceneSensors, find_media_box, look_at, parse_rig
@@ -89,8 +90,7 @@ def test_box_is_that_of_the_media(variant_rgb):
     np.testing.assert_allclose(find_media_box(_scene()), BOX, atol=1e-6)
     only_floor = mi.load_dict({"type": "scene", "floor": {"type": "rectangle"}})
     np.testing.assert_allclose(find_media_box(only_floor), [[-1, -1, 0], [1, 1, 0]], atol=1e-6)
-    with pytest.raises(MivolError, match="no shape"):
-        find_media_box(mi.load_dict({"type": "scene", "light": {"type": "constant"}}))
+    assert_refused("no shape", find_media_box, mi.load_dict({"type": "scene", "light": {"type": "constant"}}))
 
 
 def test_scene_sensors(variant_rgb):
@@ -99,8 +99,7 @@ def test_scene_sensors(variant_rgb):
     assert len(SceneSensors().sensors(scene)) == 2
     chosen = SceneSensors(indices=(1,)).sensors(scene)
     assert [s.class_name() for s in chosen] == [scene.sensors()[1].class_name()]
-    with pytest.raises(MivolError, match="no sensor 2; its sensors are 0 to 1"):
-        SceneSensors(indices=(2,)).sensors(scene)
+    assert_refused("no sensor 2; its sensors are 0 to 1", SceneSensors(indices=(2,)).sensors, scene)
 
 
 BAD = {
@@ -119,8 +118,7 @@ BAD = {
 @pytest.mark.parametrize(("table", "words"), BAD.values(), ids=BAD.keys())
 def test_bad_tables_are_refused(table, words):
     """One sentence that names the setting."""
-    with pytest.raises(MivolError, match=words):
-        parse_rig(table)
+    assert_refused(words, parse_rig, table)
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -133,13 +131,10 @@ def test_tables_name_every_rig(name):
 def test_bad_boxes_and_poses(variant_rgb):
     """Empty and infinite boxes, a camera inside without a fov, a camera that looks at itself."""
     for box in (np.zeros((2, 3)), [[0, 0, 0], [1, np.inf, 1]], [[1, 1, 1], [0, 0, 0]]):
-        with pytest.raises(MivolError, match="finite and not empty"):
-            Ring().sensors_about(np.array(box))
+        assert_refused("finite and not empty", Ring().sensors_about, np.array(box))
     inside = LookAts(origins=(tuple(CENTER + 0.1),), targets=(tuple(CENTER),))
-    with pytest.raises(MivolError, match="give it a fov"):
-        inside.sensors_about(BOX)
+    assert_refused("give it a fov", inside.sensors_about, BOX)
     # On the sphere of radius 5 about a flat box: half a turn, which no pinhole sees.
     with pytest.raises(MivolError, match="give it a fov"):
         LookAts(origins=((0, 0, 5),), targets=((0, 0, 0),)).sensors_about(np.array([[-3.0, -4, 0], [3, 4, 0]]))
-    with pytest.raises(MivolError, match="looks at its own position"):
-        LookAts(origins=((1, 1, 1),), targets=((1, 1, 1),), fov=30).sensors_about(BOX)
+    assert_refused("looks at its own position", LookAts(origins=((1, 1, 1),), targets=((1, 1, 1),), fov=30).sensors_about, BOX)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture_photos import DISTANCE, SIZE, cameras, capture, write_capture
+from refusals import assert_refused
 
 from mivol import config
 from mivol.cli import main
@@ -49,8 +50,7 @@ def test_the_middle_box_of_a_tele_lens_is_what_its_frames_share() -> None:
     around = [Camera(c.K, c.size, _moved(c, -0.3)) for c in cameras(9)]
     reach = np.median([np.linalg.norm(c.origin) for c in around])
     np.testing.assert_allclose(middle_box(around), MIDDLE * reach * np.array([[-1.0] * 3, [1.0] * 3]), atol=1e-9)
-    with pytest.raises(MivolError, match='views without a shared region, .*; choose box = "middle"'):
-        shared_box(around)
+    assert_refused('views without a shared region, .*; choose box = "middle"', shared_box, around)
 
 
 def test_the_viewing_distance_does_not_follow_far_points() -> None:
@@ -121,8 +121,7 @@ def _moved(camera: Camera, distance: float) -> np.ndarray:
 
 def test_cameras_at_their_focus_have_no_middle_box() -> None:
     turned = [Camera(intrinsics(9, 9, 4, 4), (8, 8), _moved(camera, 0.0)) for camera in cameras(4)]
-    with pytest.raises(MivolError, match="cameras that all stand in one place"):
-        middle_box(turned)
+    assert_refused("cameras that all stand in one place", middle_box, turned)
 
 
 def test_largest_limits_the_size_of_photographs(tmp_path: Path) -> None:
@@ -151,8 +150,7 @@ def test_too_large_photographs_are_refused_before_reading(tmp_path: Path, monkey
 
 
 def test_an_unknown_word_for_a_box_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(MivolError, match='"edge"'):
-        survey_photos(write_capture(tmp_path / "photos", 3), box="edge")
+    assert_refused('"edge"', survey_photos, write_capture(tmp_path / "photos", 3), box="edge")
 
 
 def test_the_colours_of_a_view_are_fitted_a_channel_at_a_time() -> None:

@@ -11,6 +11,7 @@ import pydicom
 import pytest
 from dicom_series import AXES, expected_place, header, write_frames, write_series
 from pydicom.data import get_testdata_file
+from refusals import assert_refused
 
 from mivol.cli import main
 from mivol.errors import MivolError
@@ -127,8 +128,7 @@ def test_views_of_a_turning_source_are_no_slices(tmp_path: Path) -> None:
         image = pydicom.dcmread(path)
         image.PositionerPrimaryAngle = 30.0 * k
         image.save_as(path)
-    with pytest.raises(MivolError, match=rf"views of a source from {len(paths)} angles, expected slices.*mivol optimize"):
-        read_volume(tmp_path / "s")
+    assert_refused(rf"views of a source from {len(paths)} angles, expected slices.*mivol optimize", read_volume, tmp_path / "s")
 
 
 def test_explain_and_convert_take_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -153,8 +153,7 @@ def test_a_series_is_chosen(tmp_path: Path, capsys: pytest.CaptureFixture) -> No
     some = {uid: stored() for uid in ("1.2.5", "1.2.3", "1.2.9")}
     for uid, values in some.items():
         write_series(tmp_path / "s", values, uid=uid, SeriesNumber=7 if uid == "1.2.9" else 4)
-    with pytest.raises(MivolError, match=r"3 series \(4.1 'Head 1.25' of 4 images, 4.2 .*--dataset in mivol explain"):
-        read_volume(tmp_path / "s")
+    assert_refused(r"3 series \(4.1 'Head 1.25' of 4 images, 4.2 .*--dataset in mivol explain", read_volume, tmp_path / "s")
     for dataset, uid in (("1.2.5", "1.2.5"), ("4.1", "1.2.3"), ("4.2", "1.2.5"), ("7", "1.2.9")):
         np.testing.assert_array_equal(read_volume(tmp_path / "s", dataset).values[..., 0], some[uid])
     np.testing.assert_array_equal(read_volume(tmp_path / "s" / "1.2.9-2.dcm").values[..., 0], some["1.2.9"])
@@ -201,15 +200,13 @@ def test_a_file_that_begins_otherwise_is_named(tmp_path: Path) -> None:
     (tmp_path / "s" / "notes.txt").write_text("a series")
     assert read_volume(tmp_path / "s").size[2] == 4
     path.write_bytes(bytes(132) + path.read_bytes()[132:])
-    with pytest.raises(MivolError, match=r"1.2.3-3.dcm: found a damaged DICOM file"):
-        read_volume(tmp_path / "s")
+    assert_refused(r"1.2.3-3.dcm: found a damaged DICOM file", read_volume, tmp_path / "s")
 
 
 def test_a_series_that_the_memory_does_not_hold_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_series(tmp_path / "s", stored())
     monkeypatch.setattr("mivol.files.npy.available_memory", lambda: 100)
-    with pytest.raises(MivolError, match="at most the free memory"):
-        read_volume(tmp_path / "s")
+    assert_refused("at most the free memory", read_volume, tmp_path / "s")
 
 
 @pytest.mark.parametrize(
@@ -217,12 +214,10 @@ def test_a_series_that_the_memory_does_not_hold_is_refused(tmp_path: Path, monke
 )
 def test_real_files_that_are_refused(tmp_path: Path, name: str, found: str) -> None:
     shutil.copy(get_testdata_file(name), tmp_path / name)
-    with pytest.raises(MivolError, match=found):
-        read_volume(tmp_path / name)
+    assert_refused(found, read_volume, tmp_path / name)
 
 
 def test_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     header((1, 1), "u1").save_as(tmp_path / "a.dcm", enforce_file_format=True)
     monkeypatch.setitem(sys.modules, "pydicom", None)
-    with pytest.raises(MivolError, match=r'pip install "mivol\[lab\]"'):
-        read_volume(tmp_path / "a.dcm")
+    assert_refused(r'pip install "mivol\[lab\]"', read_volume, tmp_path / "a.dcm")

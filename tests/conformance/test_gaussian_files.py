@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gaussian_sets import compressed_bytes, inria_bytes, inria_properties, inria_row, ply_bytes, random_gaussians
+from refusals import assert_refused
 
 from mivol.errors import MivolError
 from mivol.points.gaussian_files import read_gaussians, write_gaussians
@@ -97,8 +98,7 @@ HOSTILE = {
 def test_hostile_headers_end_in_a_sentence(tmp_path: Path, name: str) -> None:
     data, said = HOSTILE[name]
     (tmp_path / "a.ply").write_bytes(data)
-    with pytest.raises(MivolError, match=said):
-        read_gaussians(tmp_path / "a.ply")
+    assert_refused(said, read_gaussians, tmp_path / "a.ply")
 
 
 def test_a_text_that_promises_too_much_is_refused(tmp_path: Path) -> None:
@@ -113,8 +113,7 @@ def test_nan_in_a_file_is_named_by_index(tmp_path: Path) -> None:
     means = one.means.copy()
     means[4, 1] = np.nan
     (tmp_path / "a.ply").write_bytes(inria_bytes(Gaussians(**{**vars(one), "means": means})))
-    with pytest.raises(MivolError, match=r"a\.ply: found means that are not finite in Gaussian 4 "):
-        read_gaussians(tmp_path / "a.ply")
+    assert_refused(r"a\.ply: found means that are not finite in Gaussian 4 ", read_gaussians, tmp_path / "a.ply")
 
 
 def test_a_suffix_without_a_format_is_refused(tmp_path: Path) -> None:
@@ -123,8 +122,7 @@ def test_a_suffix_without_a_format_is_refused(tmp_path: Path) -> None:
         lambda: read_gaussians(tmp_path / "a.obj"),
         lambda: write_gaussians(tmp_path / "a.obj", random_gaussians(1, 0)),
     ):
-        with pytest.raises(MivolError, match=r"the suffix '\.obj', expected one of \.ply"):
-            use()
+        assert_refused(r"the suffix '\.obj', expected one of \.ply", use)
 
 
 def test_a_published_file_is_written_again_to_the_bit(data_dir: Path, tmp_path: Path) -> None:
@@ -171,5 +169,4 @@ def test_compressed_files_that_contradict_themselves_are_refused(tmp_path: Path,
     if old == b"element chunk 2":
         body = body[72:]
     (tmp_path / "a.ply").write_bytes(head.replace(old, new) + end + body)
-    with pytest.raises(MivolError, match=said):
-        read_gaussians(tmp_path / "a.ply")
+    assert_refused(said, read_gaussians, tmp_path / "a.ply")

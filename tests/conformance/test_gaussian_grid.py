@@ -5,9 +5,9 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
+from refusals import assert_refused
 from scipy.ndimage import map_coordinates
 
-from mivol.errors import MivolError
 from mivol.fields import gaussian_field, gaussian_grid
 from mivol.fields.gaussian_grid import (
     MAX_OPACITY,
@@ -126,16 +126,12 @@ def test_an_opacity_of_one_is_capped_and_the_box_holds_three_deviations() -> Non
 
 def test_what_cannot_be_a_grid_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     low, high = np.zeros(3), np.ones(3)
-    with pytest.raises(MivolError, match="a corner above the other, and at least 2 voxels"):
-        gaussians_to_grid(one(), high, low, 8)
-    with pytest.raises(MivolError, match="give a box that holds them"):
-        gaussians_to_grid(one((0.1, 0.1, 0.1), mean=(9, 0, 0)), low, high, 8)
-    with pytest.raises(MivolError, match="nothing to put a box around"):
-        gaussian_box(one().select(slice(0)))
+    assert_refused("a corner above the other, and at least 2 voxels", gaussians_to_grid, one(), high, low, 8)
+    assert_refused("give a box that holds them", gaussians_to_grid, one((0.1, 0.1, 0.1), mean=(9, 0, 0)), low, high, 8)
+    assert_refused("nothing to put a box around", gaussian_box, one().select(slice(0)))
     free = gaussian_grid.PAIR_BYTES * gaussian_grid.MAX_CHUNK_PAIRS + (16 * 13 + gaussian_grid.PAIR_BYTES) * 50**3
     monkeypatch.setattr("mivol.machine.available_memory", lambda: free + 1)
-    with pytest.raises(MivolError, match="a resolution of at most 50 fits"):
-        gaussians_to_grid(one(), low, high, 100)
+    assert_refused("a resolution of at most 50 fits", gaussians_to_grid, one(), low, high, 100)
 
 
 def field_of(density: np.ndarray, to_world: np.ndarray, seed: int = 1, degree: int = 1, **kind: object) -> SphericalGrid:
@@ -235,5 +231,4 @@ def test_what_makes_no_gaussians_is_refused() -> None:
         (field_of(np.zeros((2, 2, 2)), np.eye(4)), None, "holds nothing"),
         (thin, None, "give a lower resolution"),
     ):
-        with pytest.raises(MivolError, match=said):
-            grid_to_gaussians(field, resolution)
+        assert_refused(said, grid_to_gaussians, field, resolution)

@@ -15,6 +15,7 @@ import numpy as np
 import oracle_gaussians as oracle
 import pytest
 from gaussian_scenes import SIDE, boxed, camera_rays, cloud, pinhole, render, tensors_of
+from refusals import assert_refused
 from scipy.special import logit
 
 from mivol.errors import MivolError
@@ -357,5 +358,4 @@ def test_what_they_cannot_be_is_refused_by_name() -> None:
     for setting, sentence in settings:
         with pytest.raises((MivolError, RuntimeError), match=sentence):
             mi.load_dict({**gaussians, **setting})
-    with pytest.raises(MivolError, match="aovs asks for depth: ask for tau and alpha only"):
-        render(boxed(shown(cloud(2))), aovs="depth")
+    assert_refused("aovs asks for depth: ask for tau and alpha only", render, boxed(shown(cloud(2))), aovs="depth")

@@ -19,10 +19,10 @@ import PIL.Image
 import pytest
 from browser import start_browser
 from gaussian_sets import random_gaussians
+from refusals import assert_refused
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from mivol.errors import MivolError
 from mivol.experiments.render import make_camera
 from mivol.fields.surfaces import interpolate_corners
 from mivol.files.gltf import read_accessor, read_glb, turn_to_y
@@ -90,19 +90,16 @@ def test_what_a_format_cannot_hold_is_said(tmp_path: Path) -> None:
 
 
 def test_names_that_are_not_written_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(MivolError, match="read only"):
-        write_gaussians(tmp_path / "a.compressed.ply", random_gaussians(5, 0))
+    assert_refused("read only", write_gaussians, tmp_path / "a.compressed.ply", random_gaussians(5, 0))
     for suffix in sorted(GAUSSIAN_WRITERS.keys() - {".ply"}):
-        with pytest.raises(MivolError, match=f"a{suffix}: found no Gaussians"):
-            write_gaussians(tmp_path / f"a{suffix}", random_gaussians(0, 0))
+        assert_refused(f"a{suffix}: found no Gaussians", write_gaussians, tmp_path / f"a{suffix}", random_gaussians(0, 0))
 
 
 def test_2d_gaussians_are_refused_by_name(tmp_path: Path) -> None:
     write_gaussians(tmp_path / "a.ply", random_gaussians(5, 0))
     data = (tmp_path / "a.ply").read_bytes().replace(b"property float scale_2\n", b"property float extra_2\n")
     (tmp_path / "a.ply").write_bytes(data)
-    with pytest.raises(MivolError, match="found 2D Gaussians"):
-        read_gaussians(tmp_path / "a.ply")
+    assert_refused("found 2D Gaussians", read_gaussians, tmp_path / "a.ply")
 
 
 # -- glTF ----------------------------------------------------------------------------------------------------------------
@@ -182,8 +179,7 @@ def test_a_texture_of_a_glb_is_linear_in_each_triangle(tmp_path: Path, count: in
     shown = np.stack([map_coordinates(channel, nodes, order=1) for channel in np.moveaxis(texels, 2, 0)], axis=1)
     expected = np.einsum("npc,ncd->npd", weights, colours[faces]).reshape(-1, 3)
     assert np.abs(shown - expected).max() <= 0.5 / 255 + 1e-4
-    with pytest.raises(MivolError, match="--resolution"):
-        Atlas.of(3_000_000)
+    assert_refused("--resolution", Atlas.of, 3_000_000)
 
 
 # -- SOG -----------------------------------------------------------------------------------------------------------------

@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from gaussian_sets import random_gaussians
+from refusals import assert_refused
 
-from mivol.errors import MivolError
 from mivol.points.gaussians import Gaussians, concatenate, logit
 
 
@@ -48,8 +48,7 @@ def test_selection_and_concatenation_keep_every_number() -> None:
     ],
 )
 def test_shapes_that_do_not_fit_are_refused(change: dict[str, np.ndarray], said: str) -> None:
-    with pytest.raises(MivolError, match=said):
-        Gaussians(**{**vars(random_gaussians(4, 0)), **change})
+    assert_refused(said, Gaussians, **{**vars(random_gaussians(4, 0)), **change})
 
 
 @pytest.mark.parametrize(
@@ -64,8 +63,7 @@ def test_shapes_that_do_not_fit_are_refused(change: dict[str, np.ndarray], said:
 def test_numbers_that_cannot_be_drawn_are_named_by_index(name: str, value: float, said: str) -> None:
     values = np.array(getattr(random_gaussians(4, 1), name))
     values[2:] = value
-    with pytest.raises(MivolError, match=rf"{said}\(the first of 2\)"):
-        Gaussians(**{**vars(random_gaussians(4, 1)), name: values}).check()
+    assert_refused(rf"{said}\(the first of 2\)", Gaussians(**{**vars(random_gaussians(4, 1)), name: values}).check)
 
 
 def test_the_basis_is_that_of_published_files(variant_rgb: str) -> None:

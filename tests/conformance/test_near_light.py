@@ -11,6 +11,7 @@ import oracle_scattering as twins
 import pytest
 from false_alarms import assert_precise, assert_same_mean, fresh
 from numpy.typing import NDArray
+from refusals import assert_refused
 from scattering_gradients import DENSITIES, GRID, assert_gradient, gradients, weights
 from scattering_scenes import (
     PLACE,
@@ -30,7 +31,6 @@ from scattering_scenes import (
 )
 
 import scenes
-from mivol.errors import MivolError
 from mivol.scene.explain import explain_scene
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import build_estimators, build_media, make_plan
@@ -323,5 +323,4 @@ def test_refusals(setting, words):
     """An unknown word, and segments where a boundary of glass hides all emitters."""
     glass = ball_of(medium("homogeneous", 1.0, 0.8), (0, 0, 0), 1.0) | {"bsdf": {"type": "dielectric"}}
     scene = close_up({"milk": glass, "lamp": lamp()}, res=8)
-    with pytest.raises(MivolError, match=words):
-        scenes.render(scene, mivol(max_depth=4, near_light=setting), 1)
+    assert_refused(words, scenes.render, scene, mivol(max_depth=4, near_light=setting), 1)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from octrees import PLACE, random_octree
+from refusals import assert_refused
 
 from mivol import machine
 from mivol.errors import MivolError
@@ -123,8 +124,7 @@ def test_a_grid_of_an_octree_has_its_values_at_the_middles(variant_rgb: str, tmp
         owner = ((cell[row] >= corners) & (cell[row] < corners + edges[:, None])).all(axis=1)
         assert owner.sum() == 1 and grid.values()[0][row] == density[owner][0]
     write_field(tmp_path / "t.npz", tree)
-    with pytest.raises(MivolError, match="found an octree"):
-        read_grid(tmp_path / "t.npz")
+    assert_refused("found an octree", read_grid, tmp_path / "t.npz")
 
 
 def test_other_formats_take_the_grid(variant_rgb: str, tmp_path: Path) -> None:
@@ -183,8 +183,7 @@ def changed(**arrays: np.ndarray) -> dict[str, np.ndarray]:
 )  # fmt: skip
 def test_bad_files_of_svox_are_refused_in_a_sentence(variant_rgb: str, tmp_path: Path, arrays, words: str) -> None:
     np.savez(tmp_path / "t.npz", **arrays())
-    with pytest.raises(MivolError, match=words):
-        read_field(tmp_path / "t.npz")
+    assert_refused(words, read_field, tmp_path / "t.npz")
 
 
 @pytest.mark.parametrize(
@@ -208,8 +207,7 @@ def test_bad_files_of_mivol_are_refused_in_a_sentence(variant_rgb: str, tmp_path
         arrays = dict(archive)
     change(arrays)
     np.savez(tmp_path / "bad.npz", **arrays)
-    with pytest.raises(MivolError, match=words):
-        read_field(tmp_path / "bad.npz")
+    assert_refused(words, read_field, tmp_path / "bad.npz")
 
 
 def test_leaves_beyond_the_memory_are_refused_before_they_are_made(
@@ -226,10 +224,8 @@ def test_leaves_beyond_the_memory_are_refused_before_they_are_made(
     with pytest.raises(MivolError, match=r"holds densities \(395,\) .* for 2097152 leaves; \(2097152,\)"):
         octree_files.parse_octree("t.npz", arrays | {"depth": np.array(7), "tree": np.concatenate(levels)})
     monkeypatch.setattr(npy, "available_memory", lambda: 40_000)
-    with pytest.raises(MivolError, match="found arrays of .* GiB, expected at most the free memory"):
-        octree_files.parse_octree("t.npz", arrays)
+    assert_refused("found arrays of .* GiB, expected at most the free memory", octree_files.parse_octree, "t.npz", arrays)
     monkeypatch.setattr(machine, "available_memory", lambda: 10 * 2**30)
     codes, sizes = np.arange(7, dtype=np.uint64) * 8**8, np.array([8] * 6 + [0], np.uint8)
     tree = Octree.from_rows(12, np.eye(4), codes, sizes, np.ones(7), np.zeros((7, 9, 3)))
-    with pytest.raises(MivolError, match="a grid of an octree of 100663297 cells needs .* GiB .*: keep it as an octree"):
-        tree.to_grid()
+    assert_refused("a grid of an octree of 100663297 cells needs .* GiB .*: keep it as an octree", tree.to_grid)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from photo_sets import edit, pixels, png_of_16_bits, ring, write_colmap, write_transforms
 from PIL import Image
+from refusals import assert_refused
 from scipy.spatial.transform import Rotation
 
 from mivol.cli import main
-from mivol.errors import MivolError
 from mivol.files import ply
 from mivol.photos import load_photos, survey_photos
 from mivol.photos.camera_path import HomeView
@@ -155,8 +155,7 @@ BAD_ROWS = {
 def test_wrong_poses_of_llff_are_refused(tmp_path: Path, case: str) -> None:
     folder, (change, message) = write_llff(tmp_path / "set"), BAD_ROWS[case]
     np.save(folder / "poses_bounds.npy", change(np.load(folder / "poses_bounds.npy")))
-    with pytest.raises(MivolError, match=message):
-        load_photos(folder)
+    assert_refused(message, load_photos, folder)
 
 
 ROLL = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], float)
@@ -259,8 +258,7 @@ def test_cameras_of_reality_capture(tmp_path: Path) -> None:
 def test_wrong_rows_of_reality_capture_are_refused(tmp_path: Path, line: str, message: str) -> None:
     file = write_reality_capture(tmp_path / "set", (), ()) / "cameras.csv"
     file.write_text(file.read_text() + line + "\n")
-    with pytest.raises(MivolError, match=message):
-        survey_photos(tmp_path / "set")
+    assert_refused(message, survey_photos, tmp_path / "set")
 
 
 BAD_EXPORTS = {
@@ -278,8 +276,7 @@ def test_wrong_exports_of_phones_are_refused(tmp_path: Path, case: str) -> None:
     kind, name, change, message = BAD_EXPORTS[case]
     file = write_export(tmp_path / "scan", kind) / name
     file.write_text("{") if change is None else edit(file, change)
-    with pytest.raises(MivolError, match=message):
-        survey_photos(tmp_path / "scan")
+    assert_refused(message, survey_photos, tmp_path / "scan")
 
 
 @pytest.mark.parametrize("suffix", ["webp", "png"])

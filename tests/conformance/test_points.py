@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gaussian_sets import inria_bytes, ply_bytes, random_gaussians
+from refusals import assert_refused
 
-from mivol.errors import MivolError
 from mivol.points.cloud import (
     PointCloud,
     gaussians_to_points,
@@ -108,8 +108,7 @@ def test_clouds_that_cannot_be_are_refused(tmp_path: Path) -> None:
     for name, cases in hostile.items():
         for data, said in cases:
             (tmp_path / name).write_bytes(data)
-            with pytest.raises(MivolError, match=said):
-                read_points(tmp_path / name)
+            assert_refused(said, read_points, tmp_path / name)
 
 
 def test_a_published_cloud_is_read(data_dir: Path) -> None:
@@ -147,8 +146,7 @@ def test_the_centre_of_mass_is_kept_inside() -> None:
 def test_a_point_outside_is_refused_by_index() -> None:
     points = inside(20)
     points[13] += [0, 0, 10]
-    with pytest.raises(MivolError, match=r"point 13 outside the box \(the first of 1\)"):
-        points_to_density(points, (4, 5, 6), BOX)
+    assert_refused(r"point 13 outside the box \(the first of 1\)", points_to_density, points, (4, 5, 6), BOX)
 
 
 def test_each_voxel_holds_its_share_of_the_points() -> None:
@@ -170,8 +168,7 @@ def test_each_voxel_holds_its_share_of_the_points() -> None:
 
 @pytest.mark.parametrize("density", [np.zeros((2, 2, 2)), -np.ones((2, 2, 2)), np.ones((2, 2)), np.full((1, 1, 1), np.nan)])
 def test_a_density_that_nothing_can_be_drawn_from_is_refused(density: np.ndarray) -> None:
-    with pytest.raises(MivolError, match="not below 0, with mass"):
-        sample_points(density, BOX, 5, seed=0)
+    assert_refused("not below 0, with mass", sample_points, density, BOX, 5, seed=0)
 
 
 # -- Gaussians ----------------------------------------------------------------------------------------------------
@@ -209,5 +206,4 @@ def test_centres_and_colours_come_back(tmp_path: Path) -> None:
     ],
 )
 def test_points_that_make_no_gaussians_are_refused(positions: np.ndarray, opacity: float, said: str) -> None:
-    with pytest.raises(MivolError, match=said):
-        points_to_gaussians(PointCloud(positions), opacity)
+    assert_refused(said, points_to_gaussians, PointCloud(positions), opacity)

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from photo_sets import pixels, write_colmap, write_transforms
 from PIL import Image, ImageOps
+from refusals import assert_refused
 
 from mivol.cli import main
-from mivol.errors import MivolError
 from mivol.photos import colmap_process, poses, survey_photos
 from mivol.photos.listing import list_photographs
 from mivol.photos.photo_file import ORIENTATION, read_lens_facts, read_photo_header
@@ -123,14 +123,11 @@ def test_a_folder_without_poses_is_refused_with_the_command(folder: Path, capsys
 
 
 def test_what_cannot_have_poses_is_refused(folder: Path, job: dict, tmp_path: Path) -> None:
-    with pytest.raises(MivolError, match="poses in it already"):
-        poses.find_poses(write_transforms(tmp_path / "posed", {"fl_x": 20}))
+    assert_refused("poses in it already", poses.find_poses, write_transforms(tmp_path / "posed", {"fl_x": 20}))
     (tmp_path / "few").mkdir()
     Image.fromarray(pixels(8, 8)).save(tmp_path / "few" / "a.png")
-    with pytest.raises(MivolError, match="found 1 photograph in .*few, expected at least 3"):
-        poses.find_poses(tmp_path / "few")
-    with pytest.raises(MivolError, match="found no folder"):
-        poses.find_poses(tmp_path / "none")
+    assert_refused("found 1 photograph in .*few, expected at least 3", poses.find_poses, tmp_path / "few")
+    assert_refused("found no folder", poses.find_poses, tmp_path / "none")
 
 
 def test_damaged_photographs_are_left_out_and_named(folder: Path, job: dict) -> None:
@@ -144,15 +141,13 @@ def test_damaged_photographs_are_left_out_and_named(folder: Path, job: dict) -> 
     assert job["order"] == ["b.png", "near/c.webp", "near/d.jpg"]
     shutil.rmtree(folder / "sparse")
     (images / "b.png").write_bytes(b"")
-    with pytest.raises(MivolError, match="found 2 photographs without damage, expected at least 3"):
-        poses.find_poses(folder)
+    assert_refused("found 2 photographs without damage, expected at least 3", poses.find_poses, folder)
 
 
 def test_a_damaged_mask_is_refused(folder: Path, job: dict) -> None:
     (folder / "masks").mkdir()
     (folder / "masks" / "a.png").write_bytes(b"no image")
-    with pytest.raises(MivolError, match=r"masks/a.png: found a damaged or foreign file"):
-        poses.find_poses(folder)
+    assert_refused(r"masks/a.png: found a damaged or foreign file", poses.find_poses, folder)
 
 
 def test_copies_are_left_out(folder: Path, job: dict) -> None:
@@ -166,8 +161,7 @@ def test_copies_are_left_out(folder: Path, job: dict) -> None:
     for name in ("b.png", "near/c.webp", "near/d.jpg", "near/e.jpg"):
         (images / name).unlink()
     (images / "g.jpg").write_bytes((images / "a.jpg").read_bytes())
-    with pytest.raises(MivolError, match="found 1 photograph without copies of others, expected at least 3"):
-        poses.find_poses(folder)
+    assert_refused("found 1 photograph without copies of others, expected at least 3", poses.find_poses, folder)
 
 
 def test_names_with_blanks_have_aliases_and_masks_go_along(folder: Path, job: dict, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -185,8 +179,7 @@ def test_names_with_blanks_have_aliases_and_masks_go_along(folder: Path, job: di
         return [], {}
 
     monkeypatch.setattr(poses, "_run", look)
-    with pytest.raises(MivolError, match="without enough overlap"):
-        poses.find_poses(folder)
+    assert_refused("without enough overlap", poses.find_poses, folder)
     assert [job["aliases"].get(name, name) for name in job["order"]][:3] == ["a.jpg", "b 2.png", "b 10.png"]
     assert all(" " not in name for name in job["order"])
     ((name, size),) = masks
@@ -206,8 +199,7 @@ def test_pairs_without_parallax_are_the_reason(folder: Path, monkeypatch: pytest
     facts, message = FAULTS[case]
     monkeypatch.setattr(poses.importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(poses, "_run", lambda job, work, say: ([], facts))
-    with pytest.raises(MivolError, match=message):
-        poses.find_poses(folder)
+    assert_refused(message, poses.find_poses, folder)
 
 
 class Features:
@@ -288,8 +280,7 @@ def test_an_interrupted_search_continues(folder: Path, job: dict, monkeypatch: p
 
 def test_pycolmap_is_asked_for(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(poses.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(MivolError, match=r'pip install "mivol\[poses\]"'):
-        poses.find_poses(folder)
+    assert_refused(r'pip install "mivol\[poses\]"', poses.find_poses, folder)
 
 
 @pytest.mark.parametrize(
@@ -362,8 +353,7 @@ def test_a_full_disk_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch, tmp
     monkeypatch.setattr(poses, "__file__", str(tmp_path / "poses.py"))
     monkeypatch.setattr(poses.importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(poses.shutil, "disk_usage", lambda path: SimpleNamespace(free=2**24 - 1))
-    with pytest.raises(MivolError, match="filled the disk: free some space, about 2 MB for each photograph"):
-        poses.find_poses(folder)
+    assert_refused("filled the disk: free some space, about 2 MB for each photograph", poses.find_poses, folder)
 
 
 PROGRAMS = {
@@ -381,8 +371,7 @@ def test_a_program_that_finds_nothing_or_fails(
     monkeypatch.setattr(poses, "__file__", str(tmp_path / "poses.py"))
     monkeypatch.setattr(poses.importlib.util, "find_spec", lambda name: object())
     stages = []
-    with pytest.raises(MivolError, match=message):
-        poses.find_poses(folder, stages.append)
+    assert_refused(message, poses.find_poses, folder, stages.append)
     assert stages == (["matches"] if case == "nothing" else [])
     assert not (folder / "sparse").exists()
 

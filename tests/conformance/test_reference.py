@@ -24,10 +24,10 @@ from false_alarms import (
     note,
 )
 from photo_sets import look_at, ring
+from refusals import assert_refused
 from scattering_scenes import cases
 from scipy import stats
 
-from mivol.errors import MivolError
 from mivol.files.image_files import read_exr, write_exr
 from mivol.photos import Camera, Lens, intrinsics, load_photos, project, rays
 from mivol.scene.sensors import Ring, to_camera, to_sensor
@@ -322,8 +322,7 @@ def test_a_damaged_reference_of_a_cache_is_made_anew(variant_rgb, tmp_path):
         np.testing.assert_array_equal(again.mean, made.mean)
         assert read_reference(made.path).batches == made.batches
     (tmp_path / "mine.exr").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(MivolError, match="damaged OpenEXR file"):
-        _small(_scene(_grid(1.5)), tmp_path / "mine.exr")
+    assert_refused("damaged OpenEXR file", _small, _scene(_grid(1.5)), tmp_path / "mine.exr")
     assert (tmp_path / "mine.exr").read_bytes() == whole[: len(whole) // 2]
 
 
@@ -331,16 +330,12 @@ def test_another_scene_is_refused(variant_rgb, tmp_path):
     """The reference of one scene is not that of another, whether whole or begun, and is not overwritten."""
     path = tmp_path / "r.exr"
     made = _small(_scene(_grid(1.5)), path)
-    with pytest.raises(MivolError, match="reference of another scene"):
-        _small(_scene(_grid(1.6)), path)
-    with pytest.raises(MivolError, match="max_depth = 2, not 3"):
-        _small(_scene(_grid(1.5)), path, max_depth=3)
-    with pytest.raises(MivolError, match="reference of another scene"):
-        read_reference(path, "0" * 64)
+    assert_refused("reference of another scene", _small, _scene(_grid(1.6)), path)
+    assert_refused("max_depth = 2, not 3", _small, _scene(_grid(1.5)), path, max_depth=3)
+    assert_refused("reference of another scene", read_reference, path, "0" * 64)
     assert read_reference(path, made.identity["scene"]).batches == 32
     path.unlink()
-    with pytest.raises(MivolError, match="reference of another scene"):
-        _small(_scene(_grid(1.6)), path)
+    assert_refused("reference of another scene", _small, _scene(_grid(1.6)), path)
 
 
 def test_refusals(variant_rgb, tmp_path):
@@ -362,8 +357,7 @@ def test_refusals(variant_rgb, tmp_path):
         ("not a reference of mivol's", good, "other.exr", {}),
     ]
     for words, scene, name, settings in cases:
-        with pytest.raises(MivolError, match=words):
-            _small(scene, tmp_path / name, **settings)
+        assert_refused(words, _small, scene, tmp_path / name, **settings)
 
 
 def test_values_that_are_not_finite_are_located(variant_rgb, tmp_path, monkeypatch):
@@ -376,8 +370,7 @@ def test_values_that_are_not_finite_are_located(variant_rgb, tmp_path, monkeypat
         return image
 
     monkeypatch.setattr(mi, "render", poisoned)
-    with pytest.raises(MivolError, match="nan in row 2, column 3, channel 1 of batch 0"):
-        _small(_scene(_grid(1.5)), tmp_path / "r.exr")
+    assert_refused("nan in row 2, column 3, channel 1 of batch 0", _small, _scene(_grid(1.5)), tmp_path / "r.exr")
 
 
 # -- Where Mitsuba is wrong ------------------------------------------------------------------------
@@ -450,8 +443,7 @@ def test_doubt_where_mitsuba_is_wrong(variant_rgb, tmp_path, kind):
     assert_same_bounded_mean(found.mean(), 512 * found.size, shown)
     assert abs(found.mean() - right) > 0.1
     if doubts[0].fatal:
-        with pytest.raises(MivolError, match="cannot be the reference"):
-            _small(scene, tmp_path / "r.exr")
+        assert_refused("cannot be the reference", _small, scene, tmp_path / "r.exr")
         with pytest.warns(RuntimeWarning, match=re.escape(doubts[0].sentence)):
             made = _small(scene, tmp_path / "r.exr", accept_doubts=True)
         assert [d.kind for d in read_reference(made.path).doubts] == [doubts[0].kind]
@@ -722,12 +714,9 @@ def test_camera_of_a_cropped_sensor(variant_rgb: str) -> None:
 
 def test_what_mitsuba_has_no_camera_for(variant_rgb: str) -> None:
     bent = Camera(CAMERA.K, CAMERA.size, CAMERA.to_world, Lens(k1=0.1), "bent")
-    with pytest.raises(MivolError, match="bent: found a lens with distortion"):
-        to_sensor(bent)
-    with pytest.raises(MivolError, match="focal lengths 60 and 70"):
-        to_sensor(Camera(intrinsics(60, 70, 25, 30), (64, 48), np.eye(4)))
-    with pytest.raises(MivolError, match="expected a perspective sensor"):
-        to_camera(mi.load_dict({"type": "orthographic"}))
+    assert_refused("bent: found a lens with distortion", to_sensor, bent)
+    assert_refused("focal lengths 60 and 70", to_sensor, Camera(intrinsics(60, 70, 25, 30), (64, 48), np.eye(4)))
+    assert_refused("expected a perspective sensor", to_camera, mi.load_dict({"type": "orthographic"}))
 
 
 @pytest.mark.slow
@@ -758,5 +747,4 @@ def test_renders_are_photographs(variant_rgb: str, tmp_path: Path) -> None:
 
 
 def test_nothing_to_photograph_with(variant_rgb: str, tmp_path: Path) -> None:
-    with pytest.raises(MivolError, match="no sensor"):
-        render_photographs({"type": "scene", "s": {"type": "sphere"}}, tmp_path, max_depth=1)
+    assert_refused("no sensor", render_photographs, {"type": "scene", "s": {"type": "sphere"}}, tmp_path, max_depth=1)

@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from refusals import assert_refused
 
-from mivol.errors import MivolError
 from mivol.fields.sky import Sky
 
 
@@ -44,8 +44,7 @@ def test_derivatives_of_a_sky(variant_rgb: str) -> None:
 
 
 def test_a_sky_of_one_row_is_refused(variant_rgb: str) -> None:
-    with pytest.raises(MivolError, match="1 rows .* at least 2"):
-        Sky.uniform(1, 0.5)
+    assert_refused("1 rows .* at least 2", Sky.uniform, 1, 0.5)
     assert Sky.uniform(2, 0.5).image().shape == (2, 4, 3)
 
 

@@ -8,6 +8,7 @@ import zlib
 from pathlib import Path
 
 import pytest
+from refusals import assert_refused
 
 from mivol.errors import MivolError
 from mivol.files import read_columns, source
@@ -25,13 +26,11 @@ def test_streams_are_joined_up_to_the_limit(codec: str) -> None:
     with pytest.raises(MivolError, match=f"more than {len(DATA) - 1} bytes after decompression"):
         source.decompress(packed, codec, len(DATA) - 1, PATH)
     assert source.decompress(packed + packed + b"\0" * 8, codec, 2 * len(DATA), PATH) == 2 * DATA
-    with pytest.raises(MivolError, match="more than"):
-        source.decompress(packed + packed, codec, 2 * len(DATA) - 1, PATH)
+    assert_refused("more than", source.decompress, packed + packed, codec, 2 * len(DATA) - 1, PATH)
 
 
 def test_damaged_streams_are_refused() -> None:
-    with pytest.raises(MivolError, match="damaged gzip data"):
-        source.decompress(b"nothing of that kind", "gzip", 100, PATH)
+    assert_refused("damaged gzip data", source.decompress, b"nothing of that kind", "gzip", 100, PATH)
     with pytest.raises(MivolError):
         source.decompress(gzip.compress(DATA)[:-20], "gzip", len(DATA), PATH)
 
@@ -43,8 +42,7 @@ def test_a_missing_file_suggests_a_similar_name(tmp_path: Path) -> None:
         "qqqq": "check the spelling and the folder",
         "no/density.nrrd": "the folder .*no does not exist either",
     }.items():
-        with pytest.raises(MivolError, match=way_out):
-            source.read_bytes(tmp_path / name)
+        assert_refused(way_out, source.read_bytes, tmp_path / name)
     names = ["density", "temperature"]
     assert source.select_dataset(PATH, "density", names) == "density" and source.select_dataset(PATH, None, ["one"]) == "one"
     for asked, way_out in {
@@ -52,13 +50,10 @@ def test_a_missing_file_suggests_a_similar_name(tmp_path: Path) -> None:
         "qqqq": "choose another array",
         None: r"2 arrays \('density', 'temperature'\).*dataset=",
     }.items():
-        with pytest.raises(MivolError, match=way_out):
-            source.select_dataset(PATH, asked, names)
-    with pytest.raises(MivolError, match="0 arrays"):
-        source.select_dataset(PATH, None, [])
+        assert_refused(way_out, source.select_dataset, PATH, asked, names)
+    assert_refused("0 arrays", source.select_dataset, PATH, None, [])
     source.refuse_dataset(PATH, None)
-    with pytest.raises(MivolError, match="remove dataset"):
-        source.refuse_dataset(PATH, "density")
+    assert_refused("remove dataset", source.refuse_dataset, PATH, "density")
 
 
 def test_a_table_skips_comments_and_column_names(tmp_path: Path) -> None:
@@ -77,5 +72,4 @@ def test_a_table_skips_comments_and_column_names(tmp_path: Path) -> None:
 )
 def test_invalid_lines_of_a_table_are_refused(tmp_path: Path, text: str, sentence: str) -> None:
     (tmp_path / "a.txt").write_text(text)
-    with pytest.raises(MivolError, match=sentence):
-        read_columns(tmp_path / "a.txt", 2)
+    assert_refused(sentence, read_columns, tmp_path / "a.txt", 2)

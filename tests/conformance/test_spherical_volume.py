@@ -10,9 +10,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from octrees import random_octree
+from refusals import assert_refused
 from scattering_scenes import cases
 
-from mivol.errors import MivolError
 from mivol.experiments.script import explain
 from mivol.fields.field_files import read_field, write_field
 from mivol.fields.harmonics import decode_srgb_code
@@ -272,8 +272,7 @@ def test_the_space_of_colours_is_kept(variant_rgb: None, tmp_path: Path) -> None
     write_field(tmp_path / "field.npz", field)
     kept = field.select_nodes(np.ones((3, 3, 3), bool)), field.with_degree(1), read_field(tmp_path / "field.npz")
     assert [one.space for one in kept] == ["linear"] * 3
-    with pytest.raises(MivolError, match="'rec709'; srgb or linear"):
-        replace(field, space="rec709")
+    assert_refused("'rec709'; srgb or linear", replace, field, space="rec709")
 
 
 def test_a_mono_variant_shows_the_luminance(variant_rgb: None) -> None:

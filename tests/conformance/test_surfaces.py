@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
-from mivol.errors import MivolError
 from mivol.experiments.gaussian_conversion import cameras_around
 from mivol.fields.surfaces import DepthView, fuse_depths
 from mivol.photos import pixel_centres, rays
@@ -76,11 +76,8 @@ def test_what_has_no_surface_is_refused(monkeypatch: pytest.MonkeyPatch) -> None
     for view in nothing:
         view.depth[:] = np.inf
     for low, high, resolution, said in ((HIGH, LOW, 8, "a corner above the other"), (LOW, HIGH, 1, "at least 2 voxels")):
-        with pytest.raises(MivolError, match=said):
-            fuse_depths([], low, high, resolution)
-    with pytest.raises(MivolError, match="no surface was seen"):
-        fuse_depths(nothing, LOW, HIGH, 8)
+        assert_refused(said, fuse_depths, [], low, high, resolution)
+    assert_refused("no surface was seen", fuse_depths, nothing, LOW, HIGH, 8)
     monkeypatch.setattr("mivol.machine.available_memory", lambda: 64 * 100**3)
     # (1.6 / 1.7)^2 of the cube of 1000^3: 100 / that^(1/3) = 104
-    with pytest.raises(MivolError, match="a resolution of at most 104 fits"):
-        fuse_depths(nothing, LOW, HIGH, 1000)
+    assert_refused("a resolution of at most 104 fits", fuse_depths, nothing, LOW, HIGH, 1000)

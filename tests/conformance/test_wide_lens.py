@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from photo_sets import COLMAP_CAMERAS, look_at, ring, write_colmap, write_transforms
+from refusals import assert_refused
 
 from mivol.errors import MivolError
 from mivol.experiments.field_fit import explain_wide_lenses
@@ -180,8 +181,7 @@ def test_cameras_of_nerfstudio_and_instant_ngp(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_wide_cameras_are_refused(tmp_path: Path, settings: dict, said: str) -> None:
-    with pytest.raises(MivolError, match=said):
-        survey_photos(write_transforms(tmp_path / "set", settings))
+    assert_refused(said, survey_photos, write_transforms(tmp_path / "set", settings))
 
 
 @pytest.mark.parametrize("camera", [fisheye(), panorama()], ids=["fisheye", "panorama"])
@@ -251,12 +251,9 @@ def by_tiles(camera: Camera, shrink: int) -> np.ndarray:
 
 def test_functions_of_an_image_plane_refuse_wide_lenses(variant_rgb: str) -> None:
     camera = fisheye()
-    with pytest.raises(MivolError, match="fish: found a fisheye, expected a lens with an image plane"):
-        to_pinhole(camera)
-    with pytest.raises(MivolError, match="fish: .*cut pinholes out of it"):
-        to_sensor(camera)
-    with pytest.raises(MivolError, match="fish: .*cut pinholes out of it"):
-        pack_view(camera, camera.size)
+    assert_refused("fish: found a fisheye, expected a lens with an image plane", to_pinhole, camera)
+    assert_refused("fish: .*cut pinholes out of it", to_sensor, camera)
+    assert_refused("fish: .*cut pinholes out of it", pack_view, camera, camera.size)
     shown = photo(camera)
     assert rectify(shown) is shown
     with pytest.raises(MivolError, match="fish: found a wide lens, expected cameras with an image plane"):

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from mivol.cli import main
-from mivol.errors import MivolError
 from mivol.files import WRITERS, read_volume, write_volume
 from mivol.files.volume import frame_from_steps
 
@@ -135,6 +135,5 @@ def test_every_format_becomes_every_other(tmp_path: Path, source: str, target: s
 def test_what_a_format_does_not_hold_is_refused(
     tmp_path: Path, suffix: str, shape: tuple, place: np.ndarray, found: str
 ) -> None:
-    with pytest.raises(MivolError, match=found):
-        write_volume(tmp_path / f"a{suffix}", np.zeros(shape, np.float32), place)
+    assert_refused(found, write_volume, tmp_path / f"a{suffix}", np.zeros(shape, np.float32), place)
     assert not any(tmp_path.iterdir())

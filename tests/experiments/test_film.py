@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from photo_sets import ring
 from PIL import Image
+from refusals import assert_refused
 
 from mivol.config import ShowSettings
 from mivol.errors import MivolError
@@ -73,8 +74,7 @@ def test_what_nobody_asked_for_is_left_out_with_a_note() -> None:
         found = plan_film(show, photos(poses))
         (note,) = found.notes
         assert not found.cameras and note.startswith("There is no film: ") and words in note
-    with pytest.raises(MivolError, match="without a common upward direction"):
-        plan_film(ShowSettings(way="keyframes", keyframes=keys), photos(upset))
+    assert_refused("without a common upward direction", plan_film, ShowSettings(way="keyframes", keyframes=keys), photos(upset))
     down = ((0.0, 0.0, 3.0, 0.0, 0.0, 0.0), (0.0, 0.0, 4.0, 0.0, 0.0, 1.0))
     with pytest.raises(MivolError, match="a view along the upward direction"):
         plan_film(ShowSettings(way="keyframes", keyframes=down), photos(ring(4)))
@@ -142,8 +142,7 @@ def test_a_gif_needs_no_ffmpeg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         assert film.n_frames == 6 and film.info["duration"] == 50
         film.seek(5)
         np.testing.assert_allclose(np.asarray(film.convert("RGB"), float), frames()[5], atol=4)
-    with pytest.raises(MivolError, match="needs imageio-ffmpeg"):
-        write_video(tmp_path / "film.mp4", frames())
+    assert_refused("needs imageio-ffmpeg", write_video, tmp_path / "film.mp4", frames())
     assert not (tmp_path / "film.mp4").exists()
 
 
@@ -197,8 +196,7 @@ def test_invalid_films_are_refused(tmp_path: Path) -> None:
         ("film.gif", [one], {"fps": 0}, "0 frames per second"),
     ]
     for name, given, settings, message in cases:
-        with pytest.raises(MivolError, match=message):
-            write_video(tmp_path / name, given, **settings)
+        assert_refused(message, write_video, tmp_path / name, given, **settings)
     assert not list(tmp_path.iterdir())
 
 

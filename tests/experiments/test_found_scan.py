@@ -11,6 +11,7 @@ import pytest
 from beamline_files import write_named, write_nxtomo
 from photo_sets import write_blender
 from PIL import Image
+from refusals import assert_refused
 
 from mivol import config
 from mivol.cli import main
@@ -122,8 +123,7 @@ def test_names_that_no_pattern_tells_apart(tmp_path: Path) -> None:
     for name in ("a_1.tif", "a_2.tif", "a_1x2.tif"):
         Image.fromarray(np.zeros((2, 3), "u2")).save(tmp_path / name)
     groups = {group.name: group for group in found_scan.group_images(tmp_path)}
-    with pytest.raises(MivolError, match="other images between a_1.tif and its like"):
-        groups["a_#.tif"].pattern()
+    assert_refused("other images between a_1.tif and its like", groups["a_#.tif"].pattern)
     (tmp_path / "a_1x2.tif").rename(tmp_path / "a_x2.tif")
     (group,) = (group for group in found_scan.group_images(tmp_path) if group.name == "a_#.tif")
     assert group.pattern() == f"{tmp_path}/a_[0-9]*.tif"
@@ -237,8 +237,7 @@ def test_images_of_several_sizes_are_refused(tmp_path: Path) -> None:
     paths = [tmp_path / f"{k}.tif" for k in range(3)]
     for path, width in zip(paths, (3, 3, 4), strict=True):
         Image.fromarray(np.ones((2, width), "u2")).save(path)
-    with pytest.raises(MivolError, match="views of 2 x 3, 2 x 3, 2 x 4 pixels"):
-        found_scan._three_views(paths, None, None)
+    assert_refused("views of 2 x 3, 2 x 3, 2 x 4 pixels", found_scan._three_views, paths, None, None)
     with pytest.raises(MivolError, match="views, flats and darks of 2 x 3, 2 x 4, 2 x 4 pixels"):
         found_scan._three_views(paths[:2], np.ones((2, 4)), None)
 
@@ -253,8 +252,7 @@ def test_readings_without_flats(tmp_path: Path) -> None:
     assert found == {"reading": "transmission", "air": 2} and "1000 and 1000" in why and "(300)" in why
     uneven = 1000 * view * np.linspace(0.7, 1, 40)
     for other in (uneven, 1300 - 1000 * view, np.full((2, 40), 1000.0)):
-        with pytest.raises(MivolError, match="no flats, and edges with a median of"):
-            found_scan.guess_reading(tmp_path, other)
+        assert_refused("no flats, and edges with a median of", found_scan.guess_reading, tmp_path, other)
 
 
 def test_photographs_are_no_scan(tmp_path: Path) -> None:
@@ -270,8 +268,7 @@ def test_photographs_are_no_scan(tmp_path: Path) -> None:
     assert find_scan(folder) == find_scan(path) == "hdf5"
     assert draft_scan(folder).raw["data"]["file"] == str(path)
     write_nxtomo(folder / "b.nxs")
-    with pytest.raises(MivolError, match=r"2 scans \(a.nxs, b.nxs\), expected one"):
-        draft_scan(folder)
+    assert_refused(r"2 scans \(a.nxs, b.nxs\), expected one", draft_scan, folder)
 
 
 def test_a_grid_that_the_memory_holds(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from ball_photos import camera
 from photo_sets import orbit
+from refusals import assert_refused
 from tiny_experiment import assert_explained, resume_stopped_fit
 
 from mivol import config
 from mivol.cli import main
-from mivol.errors import MivolError
 from mivol.experiments.gaussian_fit import (
     adapt_to_few,
     explain_capture,
@@ -331,8 +331,7 @@ def test_random_points_avoid_transparent_pixels() -> None:
     assert says == "60 random points that no view shows as transparent"
     assert len(find_start_points(photos(views[:1] + views[3:]), 20, 5)[0]) == 20
     clear = [Photo("clear", v.image, np.zeros_like(v.alpha), None, v.camera, v.background) for v in views]
-    with pytest.raises(MivolError, match="alpha leaves no part of the box"):
-        find_start_points(photos(clear), 10, 5)
+    assert_refused("alpha leaves no part of the box", find_start_points, photos(clear), 10, 5)
 
 
 def test_scale_is_the_distance_of_neighbours() -> None:
@@ -359,5 +358,4 @@ def test_scale_is_the_distance_of_neighbours() -> None:
 
 def test_fewer_than_four_points_are_refused() -> None:
     assert len(make_start_cloud(np.eye(4, 3), [], 0)["means"]) == 4
-    with pytest.raises(MivolError, match="found 3 initial points, expected at least 4"):
-        make_start_cloud(np.eye(3), [], 0)
+    assert_refused("found 3 initial points, expected at least 4", make_start_cloud, np.eye(3), [], 0)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ball_photos import WHITE, ball, camera
+from refusals import assert_refused
 
 from mivol import config
 from mivol.cli import main
@@ -142,12 +143,9 @@ def test_explain_begins_an_octree_at_a_file(photographs: Path, capsys: pytest.Ca
 
 def test_an_octree_needs_one_box_and_a_known_background(photographs: Path) -> None:
     for field, photos in (('preset = "capture"', ""), ("", 'background = "sky"')):
-        with pytest.raises(MivolError, match="one box and a known background"):
-            make_octree_plan(config.load(toml(photographs, field, photos)))
-    with pytest.raises(MivolError, match="cpv"):
-        make_octree_plan(config.load(toml(photographs, 'preset = "cpv"')))
-    with pytest.raises(MivolError, match="srgb and the photographs are linear"):
-        read_start(photographs / "grid.npz", "linear", 1.0)
+        assert_refused("one box and a known background", make_octree_plan, config.load(toml(photographs, field, photos)))
+    assert_refused("cpv", make_octree_plan, config.load(toml(photographs, 'preset = "cpv"')))
+    assert_refused("srgb and the photographs are linear", read_start, photographs / "grid.npz", "linear", 1.0)
 
 
 def test_settings_become_a_plan(photographs: Path) -> None:

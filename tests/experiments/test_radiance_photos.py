@@ -11,6 +11,7 @@ import pytest
 from ball_photos import camera
 from photo_sets import png_of_16_bits
 from PIL import Image
+from refusals import assert_refused
 
 from mivol import config
 from mivol.cli import main
@@ -189,5 +190,4 @@ def test_gaussians_are_fitted_to_codes(photographs: Path, tmp_path: Path) -> Non
     photos, _ = read(path)
     assert (photos.space, photos.white) == ("srgb", 1.0) and max(view.image.max() for view in photos.views) < 1.01
     path.write_text(path.read_text().replace("held_out = 0", 'space = "linear"'))
-    with pytest.raises(MivolError, match='Gaussians, which are fitted to code values: choose "srgb"'):
-        read(path)
+    assert_refused('Gaussians, which are fitted to code values: choose "srgb"', read, path)

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
+from refusals import assert_refused
 from tiny_experiment import SCENE, refused, run
 
 from mivol.config import Truth
@@ -144,15 +145,13 @@ def test_a_truth_is_a_file_beside_the_experiment_or_made(tmp_path: Path) -> None
     np.testing.assert_array_equal(make_truth(experiment(Truth(key=KEY, file="truth.npz")), tmp_path, scene()), values)
     made = make_truth(experiment(Truth(key=KEY, procedural="tangle", shape=(4, 5, 6), peak=2.0)), tmp_path, scene())
     assert made.shape[:3] == (4, 5, 6) and 0 < made.max() <= 2
-    with pytest.raises(MivolError, match="nothing"):
-        make_truth(experiment(Truth(key="nothing", file="truth.npz")), tmp_path, scene())
+    assert_refused("nothing", make_truth, experiment(Truth(key="nothing", file="truth.npz")), tmp_path, scene())
 
 
 def test_a_truth_is_of_what_is_looked_for() -> None:
     check_truth(experiment(None))
     check_truth(experiment(Truth(key=KEY, file="truth.npz"), "other", KEY))
-    with pytest.raises(MivolError, match="no parameter of the fit"):
-        check_truth(experiment(Truth(key=KEY, file="truth.npz"), "other"))
+    assert_refused("no parameter of the fit", check_truth, experiment(Truth(key=KEY, file="truth.npz"), "other"))
 
 
 def test_a_scene_holds_other_values_for_a_while() -> None:

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from mivol.errors import MivolError
 from mivol.experiments import scan_corrections as corrections
@@ -101,8 +102,7 @@ def test_scattered_light_is_subtracted_if_there_is_some(monkeypatch: pytest.Monk
     ],
 )
 def test_what_cannot_be_straightened_is_refused(settings: object, beam: object, words: str) -> None:
-    with pytest.raises(MivolError, match=words):
-        corrections.straighten_lines(settings, projections(beam))
+    assert_refused(words, corrections.straighten_lines, settings, projections(beam))
 
 
 def test_nothing_is_done_unasked() -> None:

@@ -12,6 +12,7 @@ import pytest
 from ball_photos import ball, photo
 from fit_scene import KEY
 from PIL import Image
+from refusals import assert_refused
 from tiny_experiment import SCENE
 
 import mivol
@@ -221,7 +222,5 @@ def seen_by(camera: Camera, space: str) -> np.ndarray:
 def test_wrong_arguments_of_explain_and_optimize_are_named(variant_rgb: str) -> None:
     integrator = mi.load_dict({"type": "mivol"})
     for depth in (integrator, 2.5, -2):
-        with pytest.raises(MivolError, match="as max_depth, expected a whole number from -1 on"):
-            mivol.explain({"type": "scene"}, depth)
-    with pytest.raises(MivolError, match="found str, expected a problem"):
-        optimize("scene.xml")
+        assert_refused("as max_depth, expected a whole number from -1 on", mivol.explain, {"type": "scene"}, depth)
+    assert_refused("found str, expected a problem", optimize, "scene.xml")

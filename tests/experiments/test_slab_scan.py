@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from mivol import config
 from mivol.cli import main
@@ -311,5 +312,4 @@ def test_memory_bounds_the_slabs(variant_rgb: str, tmp_path: Path) -> None:
 def test_slabs_refuse(variant_rgb: str, tmp_path: Path, changes: list[str], found: str) -> None:
     text = SCAN.replace(", scale = 2.0", "") if "data.source=volume" in changes else SCAN
     (tmp_path / "fit.toml").write_text(text + CONE + ROWS)
-    with pytest.raises(MivolError, match=found):
-        plan_slabs(config.load(tmp_path / "fit.toml", changes), tmp_path)
+    assert_refused(found, plan_slabs, config.load(tmp_path / "fit.toml", changes), tmp_path)

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from fit_scene import KEY, absorbing_scene, camera, frontal, views_of_truth
+from refusals import assert_refused
 from tiny_experiment import FIT, SCENE, TRUTH, files_of, refused, run
 
 from mivol.errors import MivolError
@@ -156,8 +157,7 @@ def test_start_values_are_positive(variant_rgb, monkeypatch):
 def test_refusals(variant_rgb, monkeypatch, value, density, says):
     monkeypatch.setattr(start, "fit_emission", lambda views, place, seed: None)
     monkeypatch.setattr(start, "average_density", lambda field, place, size: np.full((2, 2, 2), density))
-    with pytest.raises(MivolError, match=says):
-        find_emissive_start(problem_of(value, np.full((2, 2, 2, 1), 0.1), 1), KEY, PLACE, Adam())
+    assert_refused(says, find_emissive_start, problem_of(value, np.full((2, 2, 2, 1), 0.1), 1), KEY, PLACE, Adam())
 
 
 def test_other_cameras_are_refused(variant_rgb):

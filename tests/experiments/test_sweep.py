@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from refusals import assert_refused
 from tiny_experiment import PHOTOS, refused, run, write_experiment
 
-from mivol.errors import MivolError
 from mivol.experiments import sweep as module
 from mivol.experiments.sweep import Sweep, SweepRun, parse_over, plan_sweep, run_name, run_sweep
 from mivol.report.page import SweepNews, SweepRow, write_sweep_page
@@ -41,8 +41,7 @@ def test_values_of_the_command_line() -> None:
     ],
 )
 def test_wrong_values_are_refused(texts: list[str], reason: str) -> None:
-    with pytest.raises(MivolError, match=reason):
-        parse_over(texts)
+    assert_refused(reason, parse_over, texts)
 
 
 def test_names_of_run_folders() -> None:
@@ -112,8 +111,7 @@ def test_two_sweeps_of_one_folder(tmp_path: Path) -> None:
     found = plan_sweep(write_experiment(tmp_path) / "fit.toml", ["seed=0..1"], (), tmp_path / "sweep")
 
     def execute(sweep: Sweep, runs: Iterator[SweepRun], tell: module.Tell) -> Iterator[tuple[SweepRun, str]]:
-        with pytest.raises(MivolError, match='another run uses the folder "sweep"'):
-            run_sweep(found, make_execute()[0])
+        assert_refused('another run uses the folder "sweep"', run_sweep, found, make_execute()[0])
         yield from ()
 
     run_sweep(found, execute)

@@ -10,10 +10,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from fit_scene import KEY
+from refusals import assert_refused
 from scipy.stats import t as student_t
 from tiny_experiment import run
 
-from mivol.errors import MivolError
 from mivol.experiments import validation
 from mivol.experiments.validation import DIFFERS, UNTRUSTED, Validation, validate_scene
 from mivol.optim.scenes.views import derive_seed
@@ -115,10 +115,8 @@ def test_passes_suit_samplers_that_round_numbers_up(variant_rgb, sampler: str, m
 
 
 def test_what_cannot_be_validated_is_refused(variant_rgb, scene: Path) -> None:
-    with pytest.raises(MivolError, match="too few"):
-        Validation(spp=3)
-    with pytest.raises(MivolError, match="no parameter"):
-        validate_scene(load_scene(scene), scene.parent / "a", Validation(parameters=("cube.none",)))
+    assert_refused("too few", Validation, spp=3)
+    assert_refused("no parameter", validate_scene, load_scene(scene), scene.parent / "a", Validation(parameters=("cube.none",)))
 
 
 def slope(ours: float, bound: float = 0.5) -> validation.Slope:
@@ -226,8 +224,7 @@ def test_a_gradient_is_checked_by_differences(variant_rgb: str, monkeypatch: pyt
     bound = student_t.isf((1 - (1 - 1e-3) ** 0.5) / 2, 15)
     assert found.bound == pytest.approx(bound * error + 0.5 / 3, rel=1e-6)
     values[:] = 0
-    with pytest.raises(MivolError, match="a.key is 0 everywhere"):
-        validation.check_gradient("scene", "camera", "ours", "a.key", chosen, level)
+    assert_refused("a.key is 0 everywhere", validation.check_gradient, "scene", "camera", "ours", "a.key", chosen, level)
 
 
 def test_every_parameter_is_checked_at_its_share_of_the_level(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 from scipy.ndimage import gaussian_filter
 
-from mivol.errors import MivolError
 from mivol.optim.projections import alignment
 from mivol.optim.projections.alignment import align_views
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
@@ -77,8 +77,7 @@ def test_still_views_stay(variant_rgb) -> None:
 )
 def test_refusals(variant_rgb, refine: list[str], views: int, said: str) -> None:
     beam = ParallelBeam(np.arange(views) * np.pi / views, (1, 16))
-    with pytest.raises(MivolError, match=said):
-        align_views(beam, VoxelGrid((1, 16, 16)), np.zeros(beam.shape), np.ones(beam.shape), refine, NONE)
+    assert_refused(said, align_views, beam, VoxelGrid((1, 16, 16)), np.zeros(beam.shape), np.ones(beam.shape), refine, NONE)
 
 
 @pytest.mark.slow

@@ -8,8 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from fit_scene import KEY, absorbing_scene, camera, views_of_truth
+from refusals import assert_refused
 
-from mivol.errors import MivolError
 from mivol.files import SparseVolumeData
 from mivol.optim.events import AdaptBricks
 from mivol.optim.first_order import Adam
@@ -103,12 +103,10 @@ def test_rows_are_carried(variant_rgb: None) -> None:
 )
 def test_what_bricks_cannot_have_is_refused(variant_rgb: None, given: dict, words: str) -> None:
     ready = {k: (PRIORS["tv"](weight=1e-3),) if k == "priors" else v for k, v in given.items()}
-    with pytest.raises(MivolError, match=words):
-        problem_of(start(), **ready)
+    assert_refused(words, problem_of, start(), **ready)
 
 
 def test_a_dense_grid_has_no_bricks(variant_rgb: None) -> None:
     values = np.ones((4, 4, 4, 1), np.float32)
     problem = SceneProblem(absorbing_scene(values), views_of_truth(values, [camera(0.3)], spp=4), [Parameter(KEY)], spp=4)
-    with pytest.raises(MivolError, match="no sparse grid among the parameters"):
-        problem.adapt_bricks(problem.initial_reals(), 0, 0.0)
+    assert_refused("no sparse grid among the parameters", problem.adapt_bricks, problem.initial_reals(), 0, 0.0)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fit_scene import KEY, small_problem
+from refusals import assert_refused
 from scattering_scenes import cases
 
 from mivol.errors import MivolError, WorkersLost
@@ -138,22 +139,18 @@ def test_refused_checkpoints(tmp_path: Path) -> None:
         ({"optimizer.lr": 0.2}, "optimizer.lr is 0.1 there and 0.2 here"),
         ({"new": 1}, "new is None there and 1 here"),
     ):
-        with pytest.raises(MivolError, match=sentence):
-            checkpoint.read(path, here | change)
+        assert_refused(sentence, checkpoint.read, path, here | change)
     hashed = {"field.kind": "hash", "field.effort": 0.5}
     for settings, kind in ((hashed | {"field.kind": "octree"}, "octree"), ({"gaussians.preset": "tiny"}, "gaussians")):
         with pytest.raises(MivolError, match=f"of the kind hash, and the kind {kind} is expected here"):
             checkpoint.read(written(tmp_path / "hash.npz", hashed), settings)
-    with pytest.raises(MivolError, match="without --resume first"):
-        checkpoint.read(tmp_path / "none.npz", here)
+    assert_refused("without --resume first", checkpoint.read, tmp_path / "none.npz", here)
     data = path.read_bytes()
     for broken in (data[: len(data) // 2], b"", b"no checkpoint at all"):
         (tmp_path / "b.npz").write_bytes(broken)
-        with pytest.raises(MivolError, match="not a whole checkpoint"):
-            checkpoint.read(tmp_path / "b.npz", here)
+        assert_refused("not a whole checkpoint", checkpoint.read, tmp_path / "b.npz", here)
     np.savez(tmp_path / "c.npz", x=1)
-    with pytest.raises(MivolError, match="not a whole checkpoint"):
-        checkpoint.read(tmp_path / "c.npz", here)
+    assert_refused("not a whole checkpoint", checkpoint.read, tmp_path / "c.npz", here)
 
 
 def test_a_full_disk_leaves_the_last_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,8 +161,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(tmp_path: Path, monkeypatch: pyt
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(atomic, "_sync", full)
-    with pytest.raises(MivolError, match="no space left"):
-        written(path, {"a": 2})
+    assert_refused("no space left", written, path, {"a": 2})
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
 

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from ball_photos import camera
+from refusals import assert_refused
 
 from mivol.errors import MivolError
 from mivol.experiments.gaussian_fit import make_start_cloud
@@ -257,18 +258,15 @@ def test_plans_follow_the_size_of_the_photographs() -> None:
 def test_memory_check_names_a_fitting_number() -> None:
     plan = PRESETS["minute"]
     room = estimate_bytes(plan, 5000, 40_000) + 10_000
-    with pytest.raises(MivolError, match=r"gaussians.most = 5000 fits"):
-        check_memory(replace(plan, start=1000), 10_000, 40_000, room)
-    with pytest.raises(MivolError, match=r"read the photographs smaller"):
-        check_memory(plan, 10**9, 40_000, 10**9)
+    assert_refused(r"gaussians.most = 5000 fits", check_memory, replace(plan, start=1000), 10_000, 40_000, room)
+    assert_refused(r"read the photographs smaller", check_memory, plan, 10**9, 40_000, 10**9)
     assert "photographs 0," in check_memory(plan, 10_000, 40_000, 10**12)
 
 
 def test_refusals(variant_rgb: str, views: list[Photo]) -> None:
     with pytest.raises(MivolError, match='control = "clone" is unknown: did you mean "clone_split"'):
         problem_of(views, replace(PLAN, control="clone"))
-    with pytest.raises(MivolError, match="3 initial points, expected at least 4"):
-        make_start_cloud(places(3), views, 0)
+    assert_refused("3 initial points, expected at least 4", make_start_cloud, places(3), views, 0)
     with pytest.raises(MivolError, match="the plan needs views shrunk by 2"):
         GaussianProblem(RayBatches.from_photos(views), [view.camera for view in views], truth(), PLAN)
     with pytest.raises(MivolError, match="all cameras are at one position"):

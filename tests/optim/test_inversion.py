@@ -6,9 +6,9 @@ import itertools
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 from small_scan import VIEWS, Views, run
 
-from mivol.errors import MivolError
 from mivol.optim.loop import Course, reconstruct
 from mivol.optim.projections.inversion import (
     SOLVERS,
@@ -57,8 +57,7 @@ def test_steps_match_the_solver(scan, name):
 
 def test_nothing_to_reconstruct_is_refused(scan):
     empty = ProjectionProblem(LeastSquares(scan[0], scan[2], weights=np.zeros(len(scan[2]))))
-    with pytest.raises(MivolError, match="so nothing to reconstruct"):
-        LinearSolve().begin(empty).step(0, 1.0)
+    assert_refused("so nothing to reconstruct", LinearSolve().begin(empty).step, 0, 1.0)
 
 
 def test_converged_solver_has_a_stop_reason():

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 from small_scan import GRID, run
 
-from mivol.errors import MivolError
 from mivol.optim.projections.linear_problems import (
     LeastSquares,
     PoissonCounts,
@@ -34,8 +34,7 @@ from mivol.tomography.projector import Projector
     ],
 )
 def test_invalid_problems_are_refused(scan, build, sentence):
-    with pytest.raises(MivolError, match=sentence):
-        build(scan[0], scan[2])
+    assert_refused(sentence, build, scan[0], scan[2])
 
 
 def test_prior_derivatives_and_majorisers():

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from false_alarms import assert_precise, assert_same_mean, fresh
 from fit_scene import KEY, absorbing_scene, camera, film, frontal, small_problem, views_of_truth
+from refusals import assert_refused
 
 from mivol.errors import MivolError
 from mivol.optim import loop
@@ -368,8 +369,7 @@ def bad_views() -> dict:
 @pytest.mark.parametrize("case", ["no views", "views of different sizes", "reference of another size", "reference with NaN"])
 def test_refused_views(variant_rgb, case: str) -> None:
     views, sentence = bad_views()[case]
-    with pytest.raises(MivolError, match=sentence):
-        SceneProblem(absorbing_scene(np.ones((2, 2, 2, 1))), views, [Parameter(KEY)])
+    assert_refused(sentence, SceneProblem, absorbing_scene(np.ones((2, 2, 2, 1))), views, [Parameter(KEY)])
 
 
 def test_nonfinite_loss_stops_the_run(variant_rgb) -> None:
@@ -377,14 +377,12 @@ def test_nonfinite_loss_stops_the_run(variant_rgb) -> None:
     problem = small_problem()
     reals, kept = problem.initial_reals(), problem.loss_and_gradient
     problem.loss_and_gradient = lambda r, i, views=0: (np.nan if i == 1 else kept(r, i, views)[0], kept(r, i, views)[1])
-    with pytest.raises(MivolError, match="became nan in iteration 1: lower the learning rate"):
-        reconstruct(problem, Adam(), 4)
+    assert_refused("became nan in iteration 1: lower the learning rate", reconstruct, problem, Adam(), 4)
     assert not np.array_equal(np.asarray(problem.values()[KEY]), np.asarray(reals[KEY]))
 
 
 def test_gauss_newton_refuses_other_losses(variant_rgb) -> None:
-    with pytest.raises(MivolError, match='"l2" or "relative_l2"'):
-        reconstruct(small_problem(loss=Huber()), GaussNewton(), 1)
+    assert_refused('"l2" or "relative_l2"', reconstruct, small_problem(loss=Huber()), GaussNewton(), 1)
 
 
 @pytest.mark.parametrize("references", ["rgb", "rgba"])
@@ -472,6 +470,5 @@ def test_a_late_loss_that_is_not_finite_names_its_iteration(variant_rgb: str, mo
     monkeypatch.setattr(loop, "time", Clock(1e-3))
     problem = LateLosses({3: np.nan})
     fit = loop.Fit(problem, LateRun(problem), Course(20))
-    with pytest.raises(MivolError, match="the loss became nan in iteration 3:"):
-        fit.complete()
+    assert_refused("the loss became nan in iteration 3:", fit.complete)
     assert fit.next_iteration == 9

@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from ball_photos import CUBE
+from refusals import assert_refused
 
-from mivol.errors import MivolError
 from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
 from mivol.optim.priors import (
     DECOUPLED_PRIORS,
@@ -166,8 +166,7 @@ def test_slope_of_tv_is_finite_where_the_field_is_flat(variant_rgb) -> None:
 
 
 def test_refuses_a_flat_array(variant_rgb) -> None:
-    with pytest.raises(MivolError, match="reshape"):
-        Sparse().value_and_gradient(np.zeros(8), SPACING)
+    assert_refused("reshape", Sparse().value_and_gradient, np.zeros(8), SPACING)
 
 
 def test_which_priors_compare_neighbours() -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from ball_photos import BOX, PLAN
+from refusals import assert_refused
 
 from mivol.errors import MivolError
 from mivol.fields.harmonics import basis_size, row_width
@@ -31,10 +32,8 @@ def test_memory_is_checked_first(variant_rgb: str, photos: list[Photo]) -> None:
     views = RayBatches.from_photos(photos[:2])
     text = check_memory(PRESETS["cpu"], BOX, views, limit=1 << 40)
     assert "MiB" in text
-    with pytest.raises(MivolError, match=r"512 nodes along an edge .* longest = (\d+) fits"):
-        check_memory(PRESETS["gpu"], BOX, views, limit=2 << 30)
-    with pytest.raises(MivolError, match="no resolution fits"):
-        check_memory(PRESETS["gpu"], BOX, views, limit=1000)
+    assert_refused(r"512 nodes along an edge .* longest = (\d+) fits", check_memory, PRESETS["gpu"], BOX, views, limit=2 << 30)
+    assert_refused("no resolution fits", check_memory, PRESETS["gpu"], BOX, views, limit=1000)
 
 
 def test_an_array_takes_a_power_of_two() -> None:
@@ -83,8 +82,7 @@ def test_suggested_resolution_fits(variant_rgb: str, photos: list[Photo], preset
         memory(longest)
     fits = int(re.search(r"longest = (\d+) fits", str(refused.value)).group(1))
     assert "about" in memory(fits)
-    with pytest.raises(MivolError, match=f"longest = {fits} fits"):
-        memory(fits + 1)
+    assert_refused(f"longest = {fits} fits", memory, fits + 1)
 
 
 def test_grids_have_cubic_voxels_and_cover_the_box(variant_rgb: str) -> None:

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from ball_photos import BOX, PLAN, WHITE, ball, camera, error_of, fitted
+from refusals import assert_refused
 from scipy.ndimage import maximum_filter
 
 from mivol.errors import MivolError
@@ -321,21 +322,15 @@ def test_beta_favours_opacities_of_0_or_1(variant_rgb: str, photos: list[Photo])
 def test_fits_that_are_refused(variant_rgb: str, photos: list[Photo]) -> None:
     batches = RayBatches.from_photos(photos[:2])
     for box, said in ((BOX[::-1], "lower and its upper"), (np.zeros(3), "lower and its upper")):
-        with pytest.raises(MivolError, match=said):
-            RadianceProblem(batches, box, replace(PLAN, stages=PLAN.stages[1:]))
-    with pytest.raises(MivolError, match="shrunk by 2"):
-        RadianceProblem(batches, BOX, PLAN)
+        assert_refused(said, RadianceProblem, batches, box, replace(PLAN, stages=PLAN.stages[1:]))
+    assert_refused("shrunk by 2", RadianceProblem, batches, BOX, PLAN)
     bent = replace(photos[0], camera=replace(photos[0].camera, distortion=Lens(k1=0.1)))
-    with pytest.raises(MivolError, match="rectify"):
-        RayBatches.from_photos([bent])
-    with pytest.raises(MivolError, match="no alpha"):
-        RayBatches.from_photos([replace(photos[0], alpha=None)], with_alpha=True)
-    with pytest.raises(MivolError, match="shrink less"):
-        RayBatches.from_photos(photos[:1], (16,))
+    assert_refused("rectify", RayBatches.from_photos, [bent])
+    assert_refused("no alpha", RayBatches.from_photos, [replace(photos[0], alpha=None)], with_alpha=True)
+    assert_refused("shrink less", RayBatches.from_photos, photos[:1], (16,))
     empty = [replace(p, image=np.ones_like(p.image)) for p in photos[:4]]
     nothing = RadianceProblem(RayBatches.from_photos(empty, (1, 2)), BOX + 50.0, PLAN)
-    with pytest.raises(MivolError, match="no view shows matter"):
-        reconstruct(nothing, PLAN.optimizer, PLAN.course())
+    assert_refused("no view shows matter", reconstruct, nothing, PLAN.optimizer, PLAN.course())
 
 
 @pytest.mark.slow

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from false_alarms import assert_precise, assert_same_mean, assert_same_variance, assert_within, fresh, note
 from fit_scene import KEY, absorbing_scene, frontal, small_problem
+from refusals import assert_refused
 from scipy import stats
 
 from mivol import config
 from mivol.cli.progress import Display
-from mivol.errors import MivolError
 from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.first_order import Adam
 from mivol.optim.loop import reconstruct
@@ -286,8 +286,7 @@ def test_exact_renders_and_pairs_have_no_message(variant_rgb) -> None:
 def test_single_sample_has_unknown_noise(variant_rgb) -> None:
     (line,) = reconstruct(cube_problem(spp=1), Adam(), 2).log
     assert "of unknown size at fit.spp = 1" in line
-    with pytest.raises(MivolError, match="found fit.spp = 1: set fit.spp to 2"):
-        reconstruct(cube_problem(spp=1, loss=L2(pairs=True)), Adam(), 1)
+    assert_refused("found fit.spp = 1: set fit.spp to 2", reconstruct, cube_problem(spp=1, loss=L2(pairs=True)), Adam(), 1)
 
 
 def test_noise_message_text(variant_rgb) -> None:
@@ -302,5 +301,4 @@ def test_pairs_are_a_setting_of_every_loss() -> None:
     for name in LOSSES:
         chosen = config.from_dict(copy.deepcopy(raw) | {"loss": {"name": name, "pairs": True}})
         assert chosen.loss == LOSSES[name](pairs=True)
-    with pytest.raises(MivolError, match='did you mean "pairs"'):
-        config.from_dict(raw | {"loss": {"name": "l2", "pair": True}})
+    assert_refused('did you mean "pairs"', config.from_dict, raw | {"loss": {"name": "l2", "pair": True}})

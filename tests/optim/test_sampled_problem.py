@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from ball_photos import BOX, error_of
+from refusals import assert_refused
 
-from mivol.errors import MivolError
 from mivol.fields.hash_encoding import HashSizes
 from mivol.fields.hash_grid import HashField
 from mivol.fields.nerf import NerfField, NerfSizes
@@ -97,8 +97,7 @@ def test_memory_is_refused_before_the_fit(variant_rgb: str, photos: list[Photo])
     batches = RayBatches.from_photos(photos[:2])
     assert "MiB: photographs 0, the fit" in check_memory(PLAN, BOX, batches, 2**40)
     large = replace(PLAN, sizes=HashSizes(log2_table=24, finest=2048, levels=16, features=8))
-    with pytest.raises(MivolError, match=r"give field.log2_table or field.samples less"):
-        check_memory(large, BOX, batches, 2**30)
+    assert_refused(r"give field.log2_table or field.samples less", check_memory, large, BOX, batches, 2**30)
 
 
 @pytest.mark.slow

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
-from mivol.errors import MivolError
 from mivol.optim.projections.scatter import FLOOR, fit_scatter
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam
 from mivol.tomography.phantoms import random_ellipsoids
@@ -79,10 +79,7 @@ def test_scattered_light_of_a_cone_beam(variant_rgb) -> None:
 
 def test_scans_that_do_not_tell_scattered_light_are_refused(variant_rgb) -> None:
     y, weights, _ = scan(BEAM, scattered(0.05), radius=2.0)
-    with pytest.raises(MivolError, match="reaches the edges of the detector"):
-        fit_scatter(BEAM, y, weights)
+    assert_refused("reaches the edges of the detector", fit_scatter, BEAM, y, weights)
     y, weights, _ = scan(BEAM, scattered(0.0))
-    with pytest.raises(MivolError, match=r"found scattered light of -.*data\.air"):
-        fit_scatter(BEAM, y - np.log(0.8), weights)
-    with pytest.raises(MivolError, match="no object"):
-        fit_scatter(BEAM, 0 * y, 1e12 * weights)
+    assert_refused(r"found scattered light of -.*data\.air", fit_scatter, BEAM, y - np.log(0.8), weights)
+    assert_refused("no object", fit_scatter, BEAM, 0 * y, 1e12 * weights)

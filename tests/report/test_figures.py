@@ -13,6 +13,7 @@ from matplotlib.image import imread
 from photo_sets import look_at, ring
 from PIL import Image
 from readable_figures import assert_readable
+from refusals import assert_refused
 
 from mivol.errors import MivolError
 from mivol.photos import Camera, PhotoSurvey, intrinsics, pixel_centres, rays
@@ -174,8 +175,7 @@ def test_near_is_light_far_is_dark_and_transparent_is_white() -> None:
     np.testing.assert_allclose(colours[1, 1], (colours[0, 1] + 255.0) / 2, atol=1)
     np.testing.assert_array_equal(normal_pixels(np.array([[[0.0, 0, 1], [-1, 0, 0]]]))[0], [[128, 128, 255], [0, 128, 128]])
     for shape, span, message in (((3,), (0, 1), "give \\(height, width\\)"), ((2, 2), (1, 1), "give near below far")):
-        with pytest.raises(MivolError, match=message):
-            depth_pixels(np.ones(shape), span)
+        assert_refused(message, depth_pixels, np.ones(shape), span)
     with pytest.raises(MivolError, match="do not fit a camera"):
         normals_from_depth(np.ones((5, 5)), Camera(intrinsics(90, 100, 30, 20), (64, 48), np.eye(4)))
 

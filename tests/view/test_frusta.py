@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from PIL import Image
+from refusals import assert_refused
 
-from mivol.errors import MivolError
 from mivol.files import write_exr
 from mivol.photos import Camera, intrinsics
 from mivol.view import frusta
@@ -109,8 +109,7 @@ def test_pictures_come_one_by_one(tmp_path: Path) -> None:
     shown = frusta.Frusta(notes, survey(*map(camera, range(1, 5)), files=files), print)
     shown.load_next()
     shown.load_next()
-    with pytest.raises(MivolError, match=r"c\.png"):
-        shown.load_next()
+    assert_refused(r"c\.png", shown.load_next)
     shown.load_next()
     assert not shown.is_loading
     assert [None if h.image is None else h.image.shape for h in notes.added] == [(80, 160, 3), (40, 160, 3), None, (20, 40, 3)]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
 from mivol.cli import main
 from mivol.errors import MivolError
@@ -304,5 +305,4 @@ def test_viser_is_asked_for(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
 
 @pytest.mark.parametrize("port", [0, 70_000])
 def test_ports_that_no_server_has_are_refused(port: int) -> None:
-    with pytest.raises(MivolError, match="expected 1 to 65535"):
-        module.start_server(port, TOKEN)
+    assert_refused("expected 1 to 65535", module.start_server, port, TOKEN)
