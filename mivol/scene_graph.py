@@ -21,6 +21,26 @@ def traverse(node: mi.Object) -> mi.SceneParameters:
     return found
 
 
+def traverse_children(node: mi.Object) -> mi.SceneParameters:
+    """Find the parameters of an object, and those of each object directly in it under its own name.
+
+    :func:`traverse` visits an object once, and lists an object with two names under the first.
+    """
+    found = mi.SceneParameters()
+    found.hierarchy[node] = (None, 0)
+    own_flags = +mi.ParamFlags.Differentiable
+    for name, value, flags, kind in _list_entries(node):
+        if isinstance(value, mi.Object):
+            child = mi.SceneParameters()
+            child.hierarchy[node] = (None, 0)
+            _add_object(child, set(), value, node, name, own_flags)
+            found.properties |= child.properties
+            found.hierarchy = child.hierarchy | found.hierarchy
+        else:
+            found.properties[name] = (value, kind, node, _parameter_flags(own_flags, flags))
+    return found
+
+
 def list_values(params: mi.SceneParameters) -> list[tuple[str, Any]]:
     """The keys and values of parameters: the pairs of ``list(params)``."""
     return [(key, read_value(params, key)) for key in params.properties]

@@ -55,8 +55,10 @@ class AdamRun(OptimizerRun):
         for name, rate in self.problem.learning_rates(iteration).items():
             self.adam.set_learning_rate({name: rate * factor})
             dr.set_grad(self.adam[name], gradients[name] / self.scale)
-        self.adam.step()
-        for name, value in self.problem.after_step(dict(self.adam.items()), iteration).items():
+        self.adam.step(eval=False)
+        moved = self.problem.after_step({name: dr.detach(value) for name, value in self.adam.items()}, iteration)
+        dr.eval(moved)  # and the moments, in the same kernels
+        for name, value in moved.items():
             self.adam[name] = value
         self.reals = {name: dr.detach(value) for name, value in self.adam.items()}
         return loss

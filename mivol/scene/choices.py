@@ -290,11 +290,16 @@ def choose_flights(medium: MediumFacts, segment: str) -> Choice | None:
     return Choice(subject, "delta tracking", "majorants of blocks are known; derivatives walk every cell")
 
 
+def count_occupied_cells(medium: MediumFacts) -> float:
+    """Number of occupied cells along the three axes of a medium's largest grid; 0 without a grid."""
+    return medium.occupied * max((sum(res) for res in medium.resolutions), default=0)
+
+
 def choose_shadows(medium: MediumFacts, needs: Needs, settings: Settings) -> Choice | None:
     """Choose whether shadow rays walk all cells of a medium or sample a few; None without shadows in a grid."""
     if not medium.resolutions or not is_scattering_visible(needs, settings) or settings.deterministic:
         return None
-    subject, cells = f"shadows of {medium.name}", medium.occupied * max(sum(r) for r in medium.resolutions)
+    subject, cells = f"shadows of {medium.name}", count_occupied_cells(medium)
     if medium.unread:
         return Choice(subject, "exact", "values cannot be read while dr.freeze records")
     if settings.shadows != "auto":
@@ -404,6 +409,11 @@ def is_near_light_open(needs: Needs, settings: Settings, segment: str) -> bool:
     return can_draw and settings.near_light == "auto" and 0 < needs.nearness < NEAR_DISTANCE
 
 
+def is_dense(medium: MediumFacts) -> bool:
+    """Whether segments through a medium also draw the light of near emitters in derivatives."""
+    return (medium.tau_max or 0.0) >= DENSE
+
+
 def choose_near_light(needs: Needs, settings: Settings, segment: str) -> tuple[bool, bool, list[Choice]]:
     """Choose whether segments of paths in media draw the light of near emitters: in images, and in derivatives."""
     subject, vertices, segments = "near emitters", "lit at collisions", "lit at a distance drawn on each segment"
@@ -426,8 +436,8 @@ def choose_near_light(needs: Needs, settings: Settings, segment: str) -> tuple[b
     why = f"{where}; a distance on each segment reaches the same error {needs.near_gain:.2g} times as fast as collisions"
     if needs.near_gain <= 1:
         return False, False, [Choice(subject, vertices, why)]
-    depths = [m.tau_max or 0.0 for m in needs.media if m.resolutions]
-    if not depths or max(depths) >= DENSE:
+    grids = [m for m in needs.media if m.resolutions]
+    if not grids or any(is_dense(m) for m in grids):
         return True, True, [Choice(subject, segments, why)]
     why += f" in an image; derivatives by a grid have less noise with collisions, up to an optical depth of about {DENSE:g}"
     return True, False, [Choice(subject, f"{segments}; in derivatives, {vertices}", why)]

@@ -28,9 +28,9 @@ from mivol.scene.previews import (
 from mivol.scene.render_tasks import find_unrecorded
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import survey_scene
+from mivol.scene_graph import traverse_children
 from mivol.transport.estimators.lighting.emitters import SceneEmitters
 from mivol.transport.estimators.lighting.tabulated_shadows import TransmittanceGrid, measure_transmittance_bias
-from mivol.transport.media.medium_view import traverse_medium
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Settings
 from mivol.transport.traversal.box import Box
 
@@ -240,7 +240,7 @@ def _describe_transfer_tables(needs: Needs) -> list[str]:
     """Error of each ``mivol_transfer`` between its nodes, compared with its table."""
     lines = []
     for facts, boundary in zip(needs.media, needs.boundaries, strict=True):
-        volumes = {key.split(".")[0]: entry[2] for key, entry in traverse_medium(boundary.medium).properties.items()}
+        volumes = {key.split(".")[0]: entry[2] for key, entry in traverse_children(boundary.medium).properties.items()}
         for name, volume in volumes.items():
             if not hasattr(volume, "mivol_transfer"):
                 continue

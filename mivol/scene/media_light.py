@@ -24,11 +24,11 @@ import numpy as np
 from mivol.kernel_recording import without_garbage_collection
 from mivol.scene.nesting import shape_bounds
 from mivol.scene.survey import OUTSIDE_SHAPES, Boundary, SceneSurvey, is_instance
-from mivol.scene_graph import list_values
+from mivol.scene_graph import list_values, traverse_children
 from mivol.transport.estimators.lighting.direct_lighting import power_heuristic
 from mivol.transport.estimators.lighting.emission_sampling import EmissionTable, EmittingBox, tabulate_emission
 from mivol.transport.media.body import Body
-from mivol.transport.media.medium_view import MediumView, traverse_medium
+from mivol.transport.media.medium_view import MediumView
 from mivol.transport.media.ray_intervals import RaySegment, draw_uniform_point, find_end
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.box import Box
@@ -111,7 +111,7 @@ def _box_of_shapes(scene: mi.Scene, medium: mi.Medium) -> np.ndarray:
 def _emission_state(view: MediumView) -> list:
     """The values behind the light of a medium: flat arrays and numbers."""
     found = []
-    for _, value in list_values(traverse_medium(view.medium)):
+    for _, value in list_values(traverse_children(view.medium)):
         if isinstance(value, int | float):
             found.append(value)
         elif dr.is_array_v(value):

@@ -74,17 +74,13 @@ def find_needs(
     """
     check_variant()
     survey = survey or survey_scene(scene)
-    recording = is_recording()
     start = [] if sensor.get_medium() is None else [sensor.get_medium()]
     boundaries = (*survey.boundaries, *find_outside_media(start, survey.boundaries))
     views = tuple(b.view(survey.grids) for b in boundaries)
     if differentiated is None:
         params = traverse(scene)
         differentiated = [(k, params.properties[k][2]) for k, v in list_values(params) if dr.grad_enabled(v)]
-    media = tuple(
-        replace(_read_medium_facts(b, view, survey, recording), misplaced=_find_misplaced(b, view, boundaries, survey))
-        for b, view in zip(boundaries, views, strict=True)
-    )
+    media = read_media(boundaries, views, survey)
     samples = spp or sensor.sampler().sample_count()
     needs = Needs(
         **vars(survey.facts),
@@ -93,7 +89,7 @@ def find_needs(
         views=views,
         media=media,
         start=sensor.get_medium(),
-        camera_inside=_may_camera_be_inside(scene, sensor, survey),
+        camera_inside=may_camera_be_inside(scene, sensor, survey),
         **_sort_parameters(differentiated),
         film_samples=int(np.prod(sensor.film().size())) * samples,
         crop_samples=int(np.prod(sensor.film().crop_size())) * samples,
@@ -106,13 +102,21 @@ def find_needs(
     )
     scatters = needs.surfaces or any(m.is_scattering for m in media)
     refused = any(m.bounded or m.has_own_walk for m in media)
-    if recording or refused or not (reads_emission and scatters and any(m.emits for m in media)):
+    if is_recording() or refused or not (reads_emission and scatters and any(m.emits for m in media)):
         return needs
     bodies = [boundary.body(view) for boundary, view in zip(boundaries, views, strict=True)]
     scattering = [body for body, facts in zip(bodies, media, strict=True) if facts.is_scattering]
     media = needs.make_media(scene, bodies, survey.size, survey.usable_tracer)
     light = read_media_light(media, boundaries, scattering, sensor, survey)
     return replace(needs, media_light=light)
+
+
+def read_media(boundaries: Sequence[Boundary], views: Sequence[MediumView], survey: SceneSurvey) -> tuple[MediumFacts, ...]:
+    """Read the facts of each boundary's medium; each state of an array is read once."""
+    return tuple(
+        replace(_read_medium_facts(b, view, survey), misplaced=_find_misplaced(b, view, boundaries, survey))
+        for b, view in zip(boundaries, views, strict=True)
+    )
 
 
 def _sort_parameters(differentiated: Sequence[tuple[str, mi.Object]]) -> dict[str, tuple[str, ...]]:
@@ -187,7 +191,7 @@ def _is_placement(key: str, owner: object) -> bool:
     return isinstance(owner, mi.Shape | mi.Sensor) and not painted
 
 
-def _may_camera_be_inside(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey) -> bool:
+def may_camera_be_inside(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey) -> bool:
     """Whether the sensor may lie in the bounding box of a traced boundary."""
     if all(b.box is not None for b in survey.boundaries):
         return False
@@ -202,7 +206,7 @@ def _may_camera_be_inside(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurve
     return bool((np.array(eye.max) + ahead >= low).all() and (np.array(eye.min) - ahead <= high).all())
 
 
-def _read_medium_facts(boundary: Boundary, view: MediumView, survey: SceneSurvey, recording: bool) -> MediumFacts:
+def _read_medium_facts(boundary: Boundary, view: MediumView, survey: SceneSurvey) -> MediumFacts:
     grids = [p.lattice for p in view.parts if p.lattice is not None]
     phase = boundary.medium.phase_function()
     common = {
@@ -219,7 +223,7 @@ def _read_medium_facts(boundary: Boundary, view: MediumView, survey: SceneSurvey
         "leaves": sum(p.field.leaves for p in view.parts if isinstance(p, OctreeExtinction)),
         "bounded": next((getattr(p.field, "kind", type(p.field).__name__) for p in view.parts if not p.exact_line), None),
     }
-    if recording:
+    if is_recording():
         # Use the last reading; a medium without a reading may scatter.
         known = survey.scatters.get(boundary.name, True)
         return MediumFacts(**common, is_scattering=known, occupied=1.0, tau_max=None, unread=True)

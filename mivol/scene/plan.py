@@ -18,6 +18,8 @@ from mivol.files.volume import VOXELS
 from mivol.scene.choices import (
     MAX_SKIPPED_SHARE,
     MAX_TRIMMED_SHARE,
+    MIN_ESTIMATED_CELLS,
+    MIN_FILLED_SHARE,
     Choice,
     choose_branches,
     choose_channels,
@@ -38,10 +40,12 @@ from mivol.scene.choices import (
     choose_successive_paths,
     choose_tracing,
     choose_transport,
+    count_occupied_cells,
+    is_dense,
     is_scattering_visible,
 )
 from mivol.scene.media_light import find_emitting_boxes
-from mivol.scene.needs import Needs
+from mivol.scene.needs import MediumFacts, Needs
 from mivol.scene.readings import PartReading, read_coarse_grid, read_part
 from mivol.scene.refusals import (
     check_bounded,
@@ -74,7 +78,7 @@ from mivol.transport.path.estimators import (
     choose_segment_estimator,
 )
 
-__all__ = ["Plan", "build_estimators", "build_media", "choose_segment", "find_skipping", "make_plan"]
+__all__ = ["Plan", "build_estimators", "build_media", "choose_segment", "find_skipping", "make_plan", "plan_key"]
 
 
 PASS_RAYS = {"llvm": 1 << 22, "cuda": 1 << 25, "metal": 1 << 24}
@@ -175,6 +179,34 @@ def find_skipping(occupied: float, is_sparse: bool) -> tuple[bool, bool]:
     return skips, skips and occupied >= MAX_SKIPPED_SHARE
 
 
+def _find_way(medium: MediumFacts) -> tuple[bool, bool]:
+    """:func:`find_skipping` of a medium's grids; false without a grid."""
+    return find_skipping(medium.occupied, any(medium.bricks)) if medium.resolutions else (False, False)
+
+
+def plan_key(medium: MediumFacts) -> tuple:
+    """All that plans depend on among the facts of a medium. Facts with the same key have plans with the same decisions.
+
+    A number counts only by the side of its limits on which it lies: a grid that changes a little keeps its plan.
+    """
+    shares = (
+        _find_way(medium),
+        count_occupied_cells(medium) < MIN_ESTIMATED_CELLS,
+        medium.occupied >= MIN_FILLED_SHARE,
+        _round_share(medium.occupied),
+    )
+    numbers = {"occupied": shares, "tau_max": is_dense(medium), "tau_min": _is_thick(medium), "albedo_min": _is_dark(medium)}
+    return tuple((vars(medium) | numbers).values())
+
+
+def _is_thick(medium: MediumFacts) -> bool:
+    return medium.tau_min >= THICK
+
+
+def _is_dark(medium: MediumFacts) -> bool:
+    return medium.albedo_min < MIN_ALBEDO
+
+
 def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> Plan:
     """Choose from the facts.
 
@@ -199,7 +231,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         choose_tracing(needs),
         choose_channels(needs),
     ]
-    ways = [find_skipping(m.occupied, any(m.bricks)) if m.resolutions else (False, False) for m in needs.media]
+    ways = [_find_way(m) for m in needs.media]
     skips, trims = tuple(skip for skip, _ in ways), tuple(trim for _, trim in ways)
     choices += [choose_storage(m) for m in needs.media if any(m.bricks)]
     choices += [choose_skipping(m, *way) for m, way in zip(needs.media, ways, strict=True) if m.resolutions]
@@ -251,8 +283,8 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         near,
         near_in_derivatives,
         tuple(k for k, distance in enumerate(needs.emitter_distances) if distance == 0),
-        tuple(m.tau_min >= THICK for m in needs.media),
-        tuple(m.albedo_min < MIN_ALBEDO for m in needs.media),
+        tuple(_is_thick(m) for m in needs.media),
+        tuple(_is_dark(m) for m in needs.media),
         _round_occupied(needs),
         lamp_rays,
         nodes,
@@ -264,7 +296,11 @@ def _round_occupied(needs: Needs) -> float | None:
     """``Plan.occupied``: in steps, so that a grid that changes a little keeps its plan."""
     if not needs.media or any(m.unread for m in needs.media):
         return None
-    return math.ceil(needs.media[0].occupied / OCCUPIED_STEP) * OCCUPIED_STEP
+    return _round_share(needs.media[0].occupied)
+
+
+def _round_share(occupied: float) -> float:
+    return math.ceil(occupied / OCCUPIED_STEP) * OCCUPIED_STEP
 
 
 def choose_segment(needs: Needs, settings: Settings) -> str:

@@ -67,6 +67,7 @@ class PlannedScene:
         arrays: arrays made for the plan.
         places: where groups of numbers are in ``arrays.placements`` (:func:`prepare_placements`).
         unrecorded: why renders are not recorded; None if they are.
+        image_needs: facts of the image from which derivatives were planned; None if they were found for the derivatives.
     """
 
     state: SceneState
@@ -77,6 +78,7 @@ class PlannedScene:
     arrays: PreparedArrays
     places: dict[bytes, int]
     unrecorded: str | None = None
+    image_needs: Needs | None = None
 
     def read_arrays(self) -> PreparedArrays:
         """The arrays of the next call. The derivatives of a ``g`` belong to one step, so they are not kept."""
@@ -85,6 +87,10 @@ class PlannedScene:
     def is_for(self, state: SceneState, spp: int) -> bool:
         """Whether a scene in this state, with so many samples, has the same facts."""
         return self.spp == spp and self.state.is_same(state)
+
+    def is_like(self, state: SceneState, spp: int) -> bool:
+        """Whether a scene in this state, with so many samples, differs at most by values that a recording follows."""
+        return self.spp == spp and self.state.sensor is state.sensor and self.state.key == state.key
 
     @cached_property
     def key(self) -> tuple:

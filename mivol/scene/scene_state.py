@@ -42,6 +42,7 @@ class SceneState:
         sensor: the sensor.
         values: the arrays that a recording follows, by their indices in Dr.Jit and with their shapes.
         others: all other arrays and numbers.
+        of_sensor: the arrays and numbers of the sensor among both.
         held: the arrays. Dr.Jit would give the index of a freed array to another array.
         differentiated: keys of the scene's parameters with gradients enabled, with their owners.
     """
@@ -49,6 +50,7 @@ class SceneState:
     sensor: mi.Sensor
     values: list = field(default_factory=list)
     others: list = field(default_factory=list)
+    of_sensor: list = field(default_factory=list)
     held: list = field(default_factory=list)
     differentiated: list[tuple[str, mi.Object]] = field(default_factory=list)
 
@@ -96,16 +98,22 @@ class SceneState:
             value, owner = read_value(params, key), params.properties[key][2]
             numbers = value if dr.is_array_v(value) else getattr(value, "matrix", None)
             if numbers is None or not dr.is_jit_v(numbers):
-                self.others.append(value if isinstance(value, int | float | str | bool) else str(value))
+                self._sort(owner, False, value if isinstance(value, int | float | str | bool) else str(value))
                 continue
             kept = dr.detach(numbers)
             self.held.append(kept)
             state = (tuple(dr.detail.collect_indices(kept)), dr.shape(kept), dr.grad_enabled(numbers))
-            (self.values if _is_followed(owner, key) else self.others).append(state)
+            self._sort(owner, _is_followed(owner, key), state)
             if state[2]:
                 differentiated.append((key, owner))
                 attached.append(numbers)
         return differentiated
+
+    def _sort(self, owner: mi.Object, is_followed: bool, state: Any) -> None:
+        """Note the state of a parameter."""
+        (self.values if is_followed else self.others).append(state)
+        if owner.ptr == self.sensor.ptr:
+            self.of_sensor.append(state)
 
 
 def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:

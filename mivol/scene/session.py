@@ -22,8 +22,14 @@ import mitsuba as mi
 from mivol.back_end import is_on_gpu
 from mivol.errors import MivolError
 from mivol.kernel_recording import CannotRecordError, Recordings, is_recording, without_garbage_collection
-from mivol.scene.needs import find_needs, warn_of_clipped_view, warn_of_misplaced_grids
-from mivol.scene.plan import make_plan, read_parts
+from mivol.scene.needs import (
+    find_needs,
+    may_camera_be_inside,
+    read_media,
+    warn_of_clipped_view,
+    warn_of_misplaced_grids,
+)
+from mivol.scene.plan import make_plan, plan_key, read_parts
 from mivol.scene.previews import measure_noise, warn_of_last_order
 from mivol.scene.readings import release_unread
 from mivol.scene.refusals import parse_aovs
@@ -43,10 +49,10 @@ from mivol.scene.scene_state import SceneState, find_gradient_array
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.stand_in import StandIn, reset_sampler
 from mivol.scene.survey import SceneSurvey, survey_scene
-from mivol.scene_graph import list_values, put_value, traverse
+from mivol.scene_graph import list_values, put_value, traverse, traverse_children
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.line_integrals.aovs import integrate_aovs
-from mivol.transport.media.medium_view import MediumView, traverse_medium
+from mivol.transport.media.medium_view import MediumView
 from mivol.transport.path.estimators import Settings
 from mivol.transport.path.film import find_batch_views
 from mivol.transport.path.walk import walk_path
@@ -58,12 +64,20 @@ class _SurveyedScene:
     """The survey of a scene, and the shapes and emitters by which the scene is recognised.
 
     The scene itself is not kept: the scene may hold the integrator of this session, and then neither would ever be freed.
-    ``is_joined`` tells whether the scene and its tracer share their arrays.
+    ``is_joined`` tells whether the scene and its tracer share their arrays. ``sources`` are the objects of whose parameters
+    plugins compute values, by pointer; None before the first gradient.
     """
 
     parts: list[mi.Object]
     survey: SceneSurvey
     is_joined: bool = False
+    sources: set[int] | None = None
+
+    def derives_from(self, scene: mi.Scene, differentiated: Sequence[tuple[str, mi.Object]]) -> bool:
+        """Whether plugins compute values from differentiated parameters (keys and owners) of the scene."""
+        if self.sources is None:
+            self.sources = {node.ptr for owner in _find_derived_owners(scene) for node in traverse(owner).hierarchy}
+        return any(owner.ptr in self.sources for _, owner in differentiated)
 
     def is_of(self, parts: list[mi.Object]) -> bool:
         """Whether ``parts`` are the very same shapes and emitters."""
@@ -142,9 +156,12 @@ class Session:
         sensor = _find_renderable_sensor(scene, sensor)
         with without_garbage_collection():
             with dr.resume_grad():
-                recompute_derived(scene)
                 attached: list[Any] = []
                 state = SceneState.of(scene, sensor, attached)
+                if self._survey(scene, state).derives_from(scene, state.differentiated):
+                    recompute_derived(scene)
+                    attached = []
+                    state = SceneState.of(scene, sensor, attached)
                 opened = self._open(scene, sensor, spp, state, for_images=False)
             self._run(GradientTask, opened, scene, sensor, _opaque_seed(seed), grad_in, attached=attached)
 
@@ -188,7 +205,7 @@ class Session:
         stand_in = self._find_stand_in(sensor, opened.state)
         if stand_in is not None:
             stand_in.meet(sensor, scene.sensors(), self.aovs)
-            stand_in.show(sensor)
+            stand_in.show(sensor, opened.state.of_sensor)
             given = (scene, stand_in.camera, *given[2:])
         self._reset(given[1])
         gradients = [(value, dr.grad(value)) for value in attached]
@@ -243,23 +260,52 @@ class Session:
             for _ in range(3):
                 self.recordings.call(JoiningTask, (), JoiningTask, scene, tracer, dr.opaque(mi.UInt32, 0))
 
-    def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, state: SceneState, for_images: bool) -> PlannedScene:
-        """Survey a new scene, find the needs, plan, and read values; all of it is kept while the scene stays the same."""
-        parts = [*scene.shapes(), *scene.emitters()]
-        is_known = self._surveyed is not None and self._surveyed.is_of(parts)
-        if not is_recording() and is_known and for_images in self._opened and self._opened[for_images].is_for(state, spp):
-            return self._opened[for_images]
-        if not is_known or not self._surveyed.survey.is_current:
+    def _survey(self, scene: mi.Scene, state: SceneState) -> _SurveyedScene:
+        """Survey a new scene, or a scene with a moved boundary."""
+        parts, kept = [*scene.shapes(), *scene.emitters()], self._surveyed
+        # What places boundaries is among the parameters whose values no recording follows.
+        is_unmoved = any(opened.state.others == state.others for opened in self._opened.values())
+        if kept is None or not kept.is_of(parts) or not (is_unmoved or kept.survey.is_current):
             self._surveyed = _SurveyedScene(parts, survey_scene(scene))
             self._opened, self._stand_ins = {}, {}
             self.recordings.clear()
-        survey, views = self._surveyed.survey, self._views
-        self._views = ()
-        if not for_images and views and not is_recording():
-            opened = self._open_like_image(scene, sensor, spp, state, views)
-            if opened is not None:
-                release_unread(survey)
-                return opened
+        return self._surveyed
+
+    def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, state: SceneState, for_images: bool) -> PlannedScene:
+        """Find the needs, plan, and read values; all of it is kept while the scene stays the same."""
+        self._survey(scene, state)
+        if is_recording():
+            return self._plan(scene, sensor, spp, state, for_images)
+        if for_images in self._opened and self._opened[for_images].is_for(state, spp):
+            return self._opened[for_images]
+        views, self._views = self._views, ()
+        opened = self._open_like_image(scene, sensor, spp, state, views) if views and not for_images else None
+        opened = opened or self._renew(scene, sensor, spp, state, for_images)
+        opened = opened or self._plan(scene, sensor, spp, state, for_images)
+        self._opened[for_images] = opened
+        release_unread(self._surveyed.survey)
+        return opened
+
+    def _renew(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, state: SceneState, for_images: bool) -> PlannedScene | None:
+        """Keep the facts and the plan for other values of the media; None if they change a fact that plans depend on."""
+        known, survey = self._opened.get(for_images), self._surveyed.survey
+        # The table of the light of media is made with the facts.
+        if known is None or not known.is_like(state, spp) or any(m.emits for m in known.needs.media):
+            return None
+        needs, boundaries = known.needs, known.needs.boundaries
+        with with_placements(known.arrays.placements, known.places):
+            views = tuple(b.view(survey.grids) for b in boundaries)
+            media = read_media(boundaries, views, survey)
+            is_inside = may_camera_be_inside(scene, sensor, survey)
+        if is_inside != needs.camera_inside or [plan_key(m) for m in media] != [plan_key(m) for m in needs.media]:
+            return None
+        readings = read_parts(replace(needs, views=views), known.plan, survey, for_images)
+        self._views = views if for_images else ()
+        return replace(known, state=state, arrays=replace(known.arrays, readings=readings))
+
+    def _plan(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, state: SceneState, for_images: bool) -> PlannedScene:
+        """Find the needs, plan, and read values."""
+        survey = self._surveyed.survey
         known = next(iter(self._opened.values()), None)
         with with_placements(None if known is None else known.arrays.placements, {} if known is None else known.places):
             needs = find_needs(scene, sensor, survey, spp, self.settings.may_draw_emission, state.differentiated)
@@ -277,12 +323,9 @@ class Session:
             placements, places = prepare_placements(needs, survey.size)
         readings = read_parts(needs, plan, survey, for_images)
         arrays = PreparedArrays(readings, light, find_batch_views(sensor), placements, survey.usable_tracer)
+        self._views = needs.views if for_images and not is_recording() else ()
         opened = PlannedScene(state, spp, survey, replace(needs, views=(), media_light=None), plan, arrays, places)
-        self._keep(opened, scene, for_images)
-        if not is_recording():
-            release_unread(survey)
-            self._views = needs.views if for_images else ()
-        return opened
+        return self._find_unrecorded(opened, scene, for_images)
 
     def _open_like_image(
         self, scene: mi.Scene, sensor: mi.Sensor, spp: int, state: SceneState, views: tuple[MediumView, ...]
@@ -292,28 +335,28 @@ class Session:
         Args:
             views: of the media, from the image.
         """
-        image = self._opened.get(True)
+        image, known = self._opened.get(True), self._opened.get(False)
         if image is None or image.spp != spp or not image.state.has_same_numbers(state):
             return None
+        if known is not None and known.image_needs is image.needs and known.is_like(state, spp):
+            return replace(known, state=state, arrays=image.arrays)
         needs = image.needs.with_parameters(state.differentiated)
         if needs is None:
             return None
         plan = make_plan(replace(needs, views=views), self.settings, self.aovs)
         if plan.readings(for_images=False) != image.plan.readings(for_images=True):
             return None
-        opened = PlannedScene(state, spp, image.survey, needs, plan, image.arrays, image.places)
-        self._keep(opened, scene, for_images=False)
-        return opened
+        opened = PlannedScene(state, spp, image.survey, needs, plan, image.arrays, image.places, image_needs=image.needs)
+        return self._find_unrecorded(opened, scene, for_images=False)
 
-    def _keep(self, opened: PlannedScene, scene: mi.Scene, for_images: bool) -> None:
-        """Find whether renders are recorded, and keep what was opened."""
+    def _find_unrecorded(self, opened: PlannedScene, scene: mi.Scene, for_images: bool) -> PlannedScene:
+        """Find whether renders are recorded."""
         known, spp = self._opened.get(for_images), opened.spp
         if known is not None and (known.spp, known.key) == (spp, opened.key):
             opened.unrecorded = known.unrecorded
         else:
             opened.unrecorded = find_unrecorded(scene, opened.state.sensor, spp, opened.needs, opened.plan, for_images)
-        if not is_recording():
-            self._opened[for_images] = opened
+        return opened
 
 
 def _find_renderable_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
@@ -390,19 +433,24 @@ def _find_differentiated(scene: mi.Scene) -> list[_DifferentiatedParameter]:
     """Find the parameters with gradients of emitters, BSDFs, phase functions and volumes."""
     if is_recording():
         return []
-    inside = [shape.interior_medium() for shape in scene.shapes() if shape.interior_medium() is not None]
-    owners = [*scene.emitters(), *(s.bsdf() for s in scene.shapes()), *(o for m in inside for o in _find_derived_owners(m))]
     parameters = []
-    for owner in {o.ptr: o for o in owners if o is not None}.values():
+    for owner in _find_derived_owners(scene):
         params = traverse(owner)
         followed = [(k, v) for k, v in list_values(params) if find_gradient_array(v) is not None]
         parameters += [_DifferentiatedParameter(params, k, type(v)(v)) for k, v in followed if not _is_computed(params, k)]
     return parameters
 
 
-def _find_derived_owners(medium: mi.Medium) -> list[mi.Object]:
+def _find_derived_owners(scene: mi.Scene) -> list[mi.Object]:
+    """The emitters, BSDFs, phase functions and volumes that may compute values from their parameters."""
+    inside = [shape.interior_medium() for shape in scene.shapes() if shape.interior_medium() is not None]
+    owners = [*scene.emitters(), *(s.bsdf() for s in scene.shapes()), *(o for m in inside for o in _find_parts(m))]
+    return list({o.ptr: o for o in owners if o is not None}.values())
+
+
+def _find_parts(medium: mi.Medium) -> list[mi.Object]:
     """The phase function of a medium, and its volumes except those read directly by transport."""
-    known = traverse_medium(medium).properties
+    known = traverse_children(medium).properties
     volumes = {key.partition(".")[0]: node for key, (_, _, node, _) in known.items() if isinstance(node, mi.Volume)}
     stands = [n for n, v in volumes.items() if n.startswith("sigma_") or hasattr(v, "mivol_extinction")]
     read = [n for n in stands if not any(f"{n}.{source}" in known for source in SOURCES)]

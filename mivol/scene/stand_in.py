@@ -152,12 +152,18 @@ class StandIn:
             parts |= {"shutter_open": opened, "shutter_close": closed, "on_lens": sensor.needs_aperture_sample()}
             self.camera = mi.load_dict({"type": "mivol_copied_camera", **parts}, parallel=False)
         self._shown: tuple | None = None
+        self._seen: tuple[int, list] | None = None
         self._lens: list[float] | None = None
         self._copies: dict[tuple, _CameraCopy] = {}
         self._met: set[int] = set()
 
-    def show(self, sensor: mi.Sensor) -> None:
-        """Take the numbers of a camera of the kind."""
+    def show(self, sensor: mi.Sensor, state: list) -> None:
+        """Take the numbers of a camera of the kind, unless it was shown last in the same state of its parameters."""
+        if self._seen != (sensor.ptr, state):
+            self._take_numbers(sensor)
+            self._seen = sensor.ptr, state
+
+    def _take_numbers(self, sensor: mi.Sensor) -> None:
         given = traverse(sensor)
         numbers, names = [given[name] for name in NUMBERS], ARRAYS[sensor.class_name()]
         arrays = [*(given[name] for name in names), given["to_world"].matrix, given["to_world"].inverse_transpose]

@@ -19,8 +19,8 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.scene.nesting import find_nesting_fault, shape_bounds
-from mivol.scene_graph import find_children, traverse
-from mivol.transport.media.medium_view import medium_kind, traverse_medium
+from mivol.scene_graph import find_children, traverse, traverse_children
+from mivol.transport.media.medium_view import medium_kind
 
 # exp(-x) is 0 in float32 (denormals flushed) from x = 87.3. Mitsuba divides by this probability of passing without a collision.
 MAX_OPTICAL_DEPTH = 87.0
@@ -321,7 +321,7 @@ class MediumShape:
 def read_medium_shape(shape: mi.Shape) -> MediumShape:
     """Read the facts of a shape with a medium inside."""
     geometry = traverse(shape)
-    params = traverse_medium(shape.interior_medium())
+    params = traverse_children(shape.interior_medium())
     volumes = _extinction_volumes(shape.interior_medium())
     stock = next((v for v in volumes if v.class_name() in ("GridVolume", "ConstVolume")), None)
     kind = medium_kind(shape.interior_medium())
@@ -455,7 +455,7 @@ def find_rgb_extinctions(scene: mi.Scene) -> list[RgbExtinction]:
     for i, medium in enumerate(media):
         if any(medium is other for other in media[:i]):
             continue
-        params = traverse_medium(medium)
+        params = traverse_children(medium)
         keys = [k for k in params.keys() if k.partition(".")[0] in ("sigma_t", "sigma_a", "sigma_s")]  # noqa: SIM118
         values = {key: _copy_values(params[key]) for key in keys}
         values = {k: v for k, v in values.items() if v.ndim and v.shape[-1] == 3 and np.any(v != v[..., :1])}

@@ -12,9 +12,9 @@ import pytest
 from scattering_scenes import close_up, smoke
 
 from mivol.errors import MivolError
-from mivol.scene import plan
+from mivol.scene import choices, plan
 from mivol.scene.needs import MediumFacts, find_needs
-from mivol.scene.plan import build_media, make_plan
+from mivol.scene.plan import build_media, make_plan, plan_key
 from mivol.scene.survey import survey_scene
 from mivol.transport.media.grid_extinction import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path.estimators import Settings
@@ -136,6 +136,38 @@ def test_a_plan_holds_what_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     assert made.gradient_bytes == plan._plan_gradient_memory(asked)[0]
     asked.media = (thin, fog((300, 300, 300), occupied=plan.MAX_TRIMMED_SHARE), homogeneous)
     assert plan.make_plan(asked, Settings(max_depth=2)).skips_empty == (True, False, False)
+
+
+def test_facts_with_the_same_key_have_the_same_decisions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For numbers drawn around their limits; some of them differ, and some share a key."""
+    for name in ("check_scattering", "check_emission_cells", "check_quadrature", "check_placements", "check_bounded"):
+        monkeypatch.setattr(plan, name, lambda *_: None)
+    for module in (plan, choices):
+        monkeypatch.setattr(module, "MIN_FILLED_SHARE", 0.3)  # not at a step of the share
+    rng, decisions = np.random.default_rng(5), {}
+    for _ in range(400):
+        occupied = rng.uniform() * rng.choice([0.3, 1.0])
+        numbers = {
+            "occupied": occupied,
+            "tau_max": 140 * rng.uniform(),
+            "albedo_min": rng.uniform(),
+            "tau_min": 2 * rng.uniform(),
+        }
+        facts = fog((100, 100, 180), **numbers)
+        lit = {
+            "emitter_kinds": ("extended",),
+            "emitter_distances": (0.2,),
+            "near_gain": 2.0,
+            "surfaces": (),
+            "has_lamps": False,
+        }
+        asked = needs(facts, boundaries=[SimpleNamespace(box="a box", hole=None, around=None)], are_emitters_far=False,
+                      nearness=0.2, is_sealed=False, branch_noise=None, are_samples_independent=False,
+                      views=(), **lit)  # fmt: skip
+        for depth in (2, 4):
+            made = plan.make_plan(asked, Settings(max_depth=depth)).decisions
+            assert decisions.setdefault((depth, plan_key(facts)), made) == made
+    assert 20 < len(decisions) < 400 and len(set(decisions.values())) > 20
 
 
 CASES = [(False, False, 2), (True, False, 2), (False, True, 2), (False, False, 4)]

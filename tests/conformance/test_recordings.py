@@ -258,6 +258,45 @@ def test_each_camera_of_a_scene_has_its_own_facts() -> None:
         pair.assert_same(1, sensor=sensor)
 
 
+def test_a_camera_that_moves_into_a_traced_boundary_has_new_facts() -> None:
+    """A recording follows the place of a camera, and a plan tells inside from outside."""
+    ball = ball_of(medium("homogeneous", 1.5, 0.0), (0, 0, 0), 1.2) | {"bsdf": {"type": "thindielectric"}}
+    eye = camera((0.0, -4.0, 0.5), (0.0, 0.1, 0.5), res=6, fov=35.0)
+    scene, kept = mi.load_dict({"type": "scene", "ball": ball, "sky": sky(1.0), "eye": eye}), mi.load_dict(mivol(max_depth=3))
+    params, pictures, inside = mi.traverse(scene), [], []
+    for y in (-4.0, 0.0):
+        params["eye.to_world"] = mi.Transform4f().look_at([0, y, 0.5], [0, y + 1, 0.5], [0, 0, 1])
+        params.update()
+        pictures += [np.array(mi.render(scene, integrator=i, seed=1, spp=2)) for i in (kept, mi.load_dict(mivol(max_depth=3)))]
+        inside.append(kept.session._opened[True].needs.camera_inside)
+    assert inside == [False, True]
+    assert np.array_equal(pictures[0], pictures[1]) and np.array_equal(pictures[2], pictures[3])
+    assert not np.array_equal(pictures[1], pictures[3])
+
+
+@pytest.mark.parametrize(
+    ("key", "computes"),
+    [
+        ("sky.data", True),
+        ("floor.bsdf.reflectance.data", True),
+        (INSIDE + "albedo.data", True),
+        (INSIDE + "sigma_t.data", False),
+    ],
+)
+def test_values_that_plugins_compute_are_known_by_their_sources(key: str, computes: bool) -> None:
+    """Transport reads an extinction from its parameter; all else is computed anew before a gradient."""
+    grids = (grid_volume("gridvolume", rough_grid(4, value).astype(np.float32), PLACE) for value in (3.0, 0.9))
+    texture = {"type": "bitmap", "data": mi.TensorXf(np.full((2, 2, 3), 0.5, np.float32)), "raw": True}
+    floor = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.full((4, 8, 3), 0.5, np.float32))}
+    scene = close_up({"smoke": box_of(medium("heterogeneous", *grids), PLACE), "floor": floor, "sky": sky}, res=6)
+    dr.enable_grad(mi.traverse(scene)[key])
+    state = SceneState.of(scene, scene.sensors()[0])
+    assert [name for name, _ in state.differentiated] == [key]
+    surveyed = mi.load_dict(mivol(max_depth=3)).session._survey(scene, state)
+    assert surveyed.derives_from(scene, state.differentiated) is computes
+
+
 @pytest.mark.parametrize(
     ("make", "key", "value"),
     [
@@ -343,6 +382,45 @@ def test_a_changed_grid_is_read_without_tracing(monkeypatch: pytest.MonkeyPatch)
     assert (len(traced), survey.recorded.count) == first and first[0] > 0
 
 
+def test_a_changed_grid_keeps_its_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Until a fact of the plan changes. Images and gradients are those of an integrator that has seen nothing before."""
+    scene, planned = smoke_under(sun=sun([0.3, 0.2, -1.0])[0]), []
+    params, key, kept = mi.traverse(scene), INSIDE + "sigma_t.data", mi.load_dict(mivol(max_depth=4))
+    find_needs, make_plan = session.find_needs, session.make_plan
+    monkeypatch.setattr(session, "find_needs", lambda *given: [planned.append("facts"), find_needs(*given)][1])
+    monkeypatch.setattr(session, "make_plan", lambda *given: [planned.append("plan"), make_plan(*given)][1])
+    set_thread_count(1)
+    grid = np.array(params[key])
+    sparse = np.where(np.arange(grid.size).reshape(grid.shape) < 2, 3.0, 0.0)
+    for values, plans in ((grid, 2), (0.9 * grid, 0), (0.8 * grid, 0), (sparse, 2), (1.5 * sparse, 0)):
+        found, before = [], len(planned)
+        for integrator in (kept, mi.load_dict(mivol(max_depth=4))):
+            params[key] = mi.TensorXf(values.astype(np.float32))
+            params.update()
+            dr.enable_grad(params[key])
+            image = mi.render(scene, params, integrator=integrator, seed=1, spp=2)
+            dr.backward(dr.mean(image, axis=None))
+            found.append((np.array(image), np.array(dr.grad(params[key]))))
+            if integrator is kept:
+                assert planned[before:].count("plan") == plans and planned[before:].count("facts") == min(plans, 1)
+        for one, other in zip(*found, strict=True):
+            assert np.array_equal(one, other) and np.abs(one).max() > 0
+
+
+def test_a_new_light_of_media_is_planned_anew() -> None:
+    """The table of the light is made from the values."""
+    scene, kept, key = fire(), mi.load_dict(mivol(max_depth=3)), INSIDE + "emission_density.data"
+    params, tables = mi.traverse(scene), []
+    for values in (np.array(params[key]), np.array(params[key])[::-1]):
+        params[key] = mi.TensorXf(np.ascontiguousarray(values))
+        params.update()
+        for integrator in (kept, mi.load_dict(mivol(max_depth=3))):
+            mi.render(scene, integrator=integrator, seed=1, spp=2)
+            tables.append(np.array(integrator.session._opened[True].arrays.light[0]))
+    assert np.array_equal(tables[0], tables[1]) and np.array_equal(tables[2], tables[3])
+    assert not np.array_equal(tables[1], tables[2])
+
+
 # -- What is traced ---------------------------------------------------------------------------------------------------------
 
 
@@ -400,10 +478,10 @@ def test_a_stand_in_has_the_rays_of_the_given_camera(kind: str) -> None:
     """To the last bit, on a cropped film."""
     crop = {"width": 8, "height": 6, "crop_width": 4, "crop_height": 3, "crop_offset_x": 1, "crop_offset_y": 2}
     to_world = mi.ScalarTransform4f().look_at([3, -4, 1], [0.2, 0.1, 0], [0, 0, 1])
-    for lens in LENSES[kind]:
+    for number, lens in enumerate(LENSES[kind]):
         sensor = mi.load_dict({"type": kind, "to_world": to_world, "film": {"type": "hdrfilm", **crop}, **lens})
         stand_in = StandIn.find(sensor)
-        stand_in.show(sensor)
+        stand_in.show(sensor, [number])
         numbers = mi.Point2f(0.1, [0.2, 0.7]), mi.Point2f([0.9, 0.3], 0.4)
         (found, weight), (truth, its_weight) = (
             one.sample_ray_differential(mi.Float(0.5), mi.Float(0), *numbers) for one in (stand_in.camera, sensor)

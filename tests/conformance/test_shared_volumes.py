@@ -10,7 +10,8 @@ import scattering_scenes as small
 from false_alarms import assert_precise, assert_same_mean, difference, fresh
 from scattering_scenes import PLACE, assert_same_images, close_up, mivol, point, rough_grid
 
-from mivol.transport.media.medium_view import traverse_medium, view_medium
+from mivol.scene_graph import traverse_children
+from mivol.transport.media.medium_view import view_medium
 from mivol.validate.reference import render_reference
 from mivol.validate.statistics import Moments
 from scenes import box_of, centred, grid_volume, medium, sky, transform
@@ -55,7 +56,7 @@ def test_the_same_picture_as_volpath(name):
 
 def test_each_coefficient_stands_under_its_own_name():
     interior = close_up(MEDIA["constvolumes"]()).shapes()[0].interior_medium()
-    assert {"sigma_t.value.value", "albedo.value.value"} <= set(traverse_medium(interior).properties)
+    assert {"sigma_t.value.value", "albedo.value.value"} <= set(traverse_children(interior).properties)
     np.testing.assert_allclose(view_medium(interior).parts[0].lattice.to_world, centred(1.5 * np.eye(3)), atol=1e-6)
     interior = close_up(MEDIA["sigma_a and sigma_s"]()).shapes()[0].interior_medium()
     assert [p.name for p in view_medium(interior).parts] == ["sigma_a", "sigma_s"]

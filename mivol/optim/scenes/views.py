@@ -24,7 +24,9 @@ PRIMAL, ADJOINT, HELD_OUT, FINAL = range(4)
 
 def derive_seed(*key: int) -> int:
     """A 32-bit seed from integers. SeedSequence makes the seeds of similar keys independent."""
-    return int(np.random.SeedSequence(key).generate_state(1)[0])
+    # An array of words is taken as it is; numbers would be converted one by one.
+    words = np.array(key, np.uint32) if max(key) < 1 << 32 else key
+    return int(np.random.SeedSequence(words).generate_state(1)[0])
 
 
 @with_short_repr

@@ -25,7 +25,7 @@ from mivol.fields.plugin_field import PluginField
 from mivol.fields.protocol import BOUNDED, Field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.kernel_recording import is_recording
-from mivol.scene_graph import find_children, list_values, traverse
+from mivol.scene_graph import find_children, list_values, traverse, traverse_children
 from mivol.transport.media.extinction import BoundedExtinction, ConstantExtinction, Extinction
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridExtinction
@@ -34,7 +34,7 @@ from mivol.transport.media.stock_grids import StockGrids
 from mivol.transport.traversal.box import Box
 from mivol.transport.traversal.lattice import Lattice
 
-__all__ = ["ASYMMETRY", "MediumView", "nested_field", "read_asymmetry", "traverse_medium", "view_medium"]
+__all__ = ["ASYMMETRY", "MediumView", "nested_field", "read_asymmetry", "view_medium"]
 
 
 @dataclass
@@ -131,7 +131,7 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, grids: StockGrid
         MivolError: a medium or a volume of another kind.
     """
     kind = medium_kind(medium)
-    params = traverse_medium(medium)
+    params = traverse_children(medium)
     if kind not in (*STOCK, "mivol_medium"):
         raise MivolError(f"a medium of type {kind} was found; mivol_medium, homogeneous or heterogeneous is expected.")
     children = find_children(medium)
@@ -286,20 +286,6 @@ def nested_field(medium: mi.Medium) -> SphericalGrid | None:
     """The radiance field of a medium, if the field has more than one level; otherwise None."""
     field = getattr(find_children(medium).get("emission"), "mivol_field", None)
     return field if field is not None and field.levels > 1 else None
-
-
-def traverse_medium(medium: mi.Medium) -> mi.SceneParameters:
-    """The parameters of a medium, each coefficient under its own name.
-
-    ``mi.traverse`` visits an object once. A volume used as both ``sigma_t`` and ``albedo`` (by a ``ref``, or because Mitsuba
-    merges equal objects of a scene) is listed under a single name there, and under both names here.
-    """
-    params = traverse(medium)
-    for name, child in find_children(medium).items():
-        own = traverse(child)
-        params.properties |= {f"{name}.{key}": entry for key, entry in own.properties.items()}
-        params.hierarchy |= {node: entry for node, entry in own.hierarchy.items() if node not in params.hierarchy}
-    return params
 
 
 def _field_part(
