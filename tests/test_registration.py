@@ -49,7 +49,7 @@ def said(copy: Path, code: str) -> list[str]:
 @pytest.mark.slow_for("mitsuba first", "mivol first")
 @pytest.mark.parametrize("order", ORDERS.values(), ids=ORDERS.keys())
 def test_each_variant_gets_its_plugins(copy: Path, order: str) -> None:
-    """Scalar variants get none; no shell runs before there is a variant, out of order, or twice for one switch."""
+    """Scalar variants get no shell; no shell runs before there is a variant, out of order, or twice for one switch."""
     switch = "".join(f"\nmi.set_variant({name!r})" for name in SWITCHES)
     expected = [f"{shell} {name}" for name in SWITCHES if name.startswith("llvm") for shell in plugins.MODULES]
     assert said(copy, order + switch) == expected
@@ -57,3 +57,8 @@ def test_each_variant_gets_its_plugins(copy: Path, order: str) -> None:
 
 def test_no_variant_no_plugin(copy: Path) -> None:
     assert said(copy, "import mivol, sys; print(any('plugins.volumes' in name for name in sys.modules))") == ["False"]
+
+
+def test_a_scalar_variant_says_where_mivol_works() -> None:
+    done = run_child("import mivol, mitsuba as mi; mi.set_variant('scalar_rgb'); mi.load_dict({'type': 'mivol'})")
+    assert 'the variant "scalar_rgb" is active; mivol works in llvm_ad_rgb' in done.stderr

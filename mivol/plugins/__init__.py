@@ -11,13 +11,18 @@ import sys
 
 import mitsuba as mi
 
+from mivol.back_end import check_variant
+
 MODULES = ("volumes", "phases", "media", "sensors", "integrators")  # order = dependency order
 
 
 def _register() -> None:
-    # Register nothing in scalar_*: Mitsuba takes a plugin's kind from scalar_rgb, and a volume registered as a texture
-    # (Mitsuba has no register_volume) would then be a texture in every variant.
-    if mi.variant() is None or mi.variant().startswith("scalar"):
+    if mi.variant() is None:
+        return
+    # In scalar_* register an integrator alone, which says what works. Mitsuba takes a plugin's kind from scalar_rgb, and a
+    # volume registered as a texture (Mitsuba has no register_volume) would then be a texture in every variant.
+    if mi.variant().startswith("scalar"):
+        mi.register_integrator("mivol", lambda props: check_variant())
         return
     for name in MODULES:
         qualified = f"{__name__}.{name}"
