@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from sampled_fields import CUBE
 
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.loop import Fit, begin_fit
@@ -14,7 +15,6 @@ from mivol.photos import Camera, Photo
 from mivol.photos.camera import intrinsics
 
 BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
-CUBE = np.array([[2.0, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]])
 WHITE = np.ones(3, np.float32)
 
 

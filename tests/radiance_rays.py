@@ -21,7 +21,6 @@ from mivol.transport.traversal.occupied_cells import CellIndex
 
 TO_WORLD = np.array([[2.0, 0.3, 0.0, -1.2], [-0.2, 1.5, 0.1, -0.7], [0.0, 0.1, 2.5, -1.3], [0, 0, 0, 1]])
 """Rotated a little, sheared and of three lengths."""
-CUBE = np.array([[2.0, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]])
 
 
 def make(res=(5, 6, 7), basis=4, seed=0, scale=6.0):

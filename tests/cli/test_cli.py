@@ -9,13 +9,21 @@ from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
+import msgspec
 import numpy as np
 import pytest
 from tiny_experiment import PHOTOS, SCENE, refused, run, write_experiment
 
 from mivol.cli import VERBS, describe_error, load_named_scene, main, parse
+from mivol.config import ScanExperiment, SceneExperiment, Sought
 from mivol.errors import MivolError, MivolWarning
 from mivol.files import read_exr
+from mivol.optim.events import Checkpoint, Evaluate, UpdateOccupancy
+from mivol.optim.first_order import Adam
+from mivol.optim.losses import L2
+from mivol.optim.optimizer import Constant
+from mivol.optim.priors import DecoupledPrior, Smoothness, Sparsity, ViewDependence
+from mivol.optim.projections.inversion import LinearSolve
 
 
 @pytest.fixture
@@ -245,3 +253,30 @@ def test_a_doubt_of_mivol_is_one_sentence_without_a_line_of_code(monkeypatch: py
     assert main() == 0
     assert warnings.formatwarning(MivolWarning("a is cut."), MivolWarning, "ply.py", 3, "code") == "mivol: a is cut.\n"
     assert warnings.formatwarning(RuntimeWarning("1 / 0"), RuntimeWarning, "ply.py", 3, "code").startswith("ply.py:3: Runtime")
+
+
+# -- Defaults of flags -------------------------------------------------------------------------------------------------
+
+DEFAULTS = {
+    SceneExperiment: {
+        **{"held_out": None, "truth": None, "optimizer": Adam(), "schedule": Constant(), "loss": L2()},
+        "event": (Checkpoint(every=10), Evaluate(every=10)),
+    },
+    ScanExperiment: {"grid": None},
+    Sought: {"prior": ()},
+    DecoupledPrior: {"weight": 1.0},
+    Smoothness: {"weight": 1.0, "share": 0.125, "every": 1},
+    Sparsity: {"weight": 1.0},
+    ViewDependence: {"weight": 1.0},
+    UpdateOccupancy: {"every": 64},
+    LinearSolve: {
+        **{"solver": "pcg", "subsets": 10, "drift": 0, "relaxation": 1.0, "decay": 0.99, "window": "ram-lak", "cutoff": 1.0},
+        "stop_norm": 0.0,
+    },
+}
+
+
+@pytest.mark.parametrize("kind", DEFAULTS, ids=lambda kind: kind.__name__)
+def test_defaults(kind: type) -> None:
+    defaults = {field.name: field.default for field in msgspec.structs.fields(kind)}
+    assert {name: defaults[name] for name in DEFAULTS[kind]} == DEFAULTS[kind]

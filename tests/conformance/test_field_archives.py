@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from refusals import assert_refused
+from sampled_fields import CUBE
 
 from mivol.cli import main
 from mivol.experiments import field_conversion
@@ -21,8 +22,6 @@ from mivol.fields.nerf import NerfField, NerfSizes
 from mivol.fields.sampled_field import Region
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import npy
-
-CUBE = np.array([[2.0, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]])
 
 
 def arrays(res=(3, 4, 5), basis=9):

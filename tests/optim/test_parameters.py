@@ -25,6 +25,7 @@ from mivol.optim.parameters import (
     like,
     softplus,
 )
+from mivol.optim.strategy import suggest_name
 
 EPS = float(np.finfo(np.float32).eps)
 DOMAINS = {"identity": (0.0, math.inf), "softplus": (0.0, math.inf), "log": (0.0, math.inf), "logistic": (0.0, 1.0)}
@@ -141,3 +142,13 @@ def test_a_key_tells_its_unit_and_domain(key: str, unit: str, domain: tuple[floa
     assert (Parameter(key).unit, Parameter(key).domain) == (unit, domain)
     given = Parameter(key, "1/m", (-2.0, 3.0))
     assert (given.unit, given.domain) == ("1/m", (-2.0, 3.0))
+
+
+# -- Names -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("word", "way_out"), [("adm", 'did you mean "adam"?'), ("qqqq", "known are: adam, lbfgs."), ("", "known are: adam, lbfgs.")]
+)
+def test_suggestions_for_misspelt_names(word: str, way_out: str) -> None:
+    assert suggest_name(word, ["lbfgs", "adam"]) == way_out

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from photo_sets import look_at, ring
 from PIL import Image
-from readable_figures import assert_readable
+from readable_figures import assert_readable, find_unreadable
 from refusals import assert_refused
 
 from mivol.errors import MivolError
@@ -202,3 +202,32 @@ def test_a_run_writes_about_ten_previews() -> None:
     assert [k for k in range(1, 8) if is_preview_due(k, 7)] == [1, 2, 3, 4, 5, 6, 7]
     assert [k for k in range(1, 65) if is_preview_due(k, 64)] == sorted({1, 64, *range(6, 64, 6)})
     assert sum(is_preview_due(k, 5000) for k in range(1, 5001)) == 11
+
+
+# -- Readable figures --------------------------------------------------------------------------------------------------
+
+
+def labelled() -> Figure:
+    figure = Figure(figsize=(3, 2), layout="constrained")
+    figure.subplots().set(title="A title", xlabel="x [length]")
+    return figure
+
+
+def test_a_figure_with_a_title_and_a_label_is_readable() -> None:
+    assert find_unreadable(labelled()) == []
+
+
+@pytest.mark.parametrize(
+    ("spoil", "fault"),
+    [
+        (lambda figure: figure.axes[0].set(title="", xlabel=""), "axes 0 have neither a title nor a label"),
+        (lambda figure: figure.axes[0].title.set_fontsize(4), "'A title' has 4 pt"),
+        (lambda figure: figure.text(0.9, 0.5, "A long note"), "'A long note' leaves the figure"),
+        (lambda figure: figure.text(0.5, 0.93, "Another title"), "'Another title' lies on 'A title'"),
+    ],
+)
+def test_a_fault_of_a_figure_is_found(spoil: Callable[[Figure], object], fault: str) -> None:
+    figure = labelled()
+    spoil(figure)
+    (found,) = find_unreadable(figure)
+    assert found.startswith(fault)
