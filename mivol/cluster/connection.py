@@ -1,7 +1,7 @@
-"""Connect a run to the workers that ``--cluster`` names, and end what was started for it.
+"""Connect a run to the workers named by ``--cluster``, and end processes started for the run.
 
 Conventions. Only :func:`open_pool` imports Dask. A local cluster listens on the loopback address. Schedulers started by mivol
-use TLS with temporary certificates, because a worker executes what it receives.
+use TLS with temporary certificates, because a worker executes received code.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def open_pool(
     say: Say = print,
     check: Callable[[], None] = lambda: None,
 ) -> Iterator[Pool]:
-    """Connect to the workers of a cluster, check them, and close what was opened at the end.
+    """Connect to the workers of a cluster, check all workers, and close the connection at the end.
 
     Args:
         cluster: a value of ``--cluster``, settings, or a ``distributed.Client``, which stays open.
@@ -80,7 +80,7 @@ def open_pool(
 
 @contextlib.contextmanager
 def _connect(distributed: Any, settings: ClusterSettings) -> Iterator[tuple[Client, Sequence[str]]]:
-    """A client of the scheduler that the settings name, and failures of jobs; what was started ends with it."""
+    """A client of the scheduler named in the settings, and failures of jobs; started processes end with the client."""
     with contextlib.ExitStack() as stack:
         if settings.scheduler == "address":
             yield stack.enter_context(_connect_address(distributed, settings)), ()
@@ -157,7 +157,7 @@ def _start_local(distributed: Any, settings: ClusterSettings) -> Iterator[Client
 
 @contextlib.contextmanager
 def _start_jobs(distributed: Any, settings: ClusterSettings) -> Iterator[tuple[Client, list[str]]]:
-    """Jobs of a batch system, with one Dask thread and temporary certificates."""
+    """Jobs of a batch system, with a single Dask thread and temporary certificates."""
     try:
         import dask
         import dask_jobqueue
@@ -195,7 +195,7 @@ def _start_jobs(distributed: Any, settings: ClusterSettings) -> Iterator[tuple[C
 
 @contextlib.contextmanager
 def _collect_failures() -> Iterator[list[str]]:
-    """Collect what Dask logs about jobs that could not be submitted, instead of printing it."""
+    """Collect Dask's messages about jobs without submission, instead of printing them."""
     found: list[str] = []
 
     class Collector(logging.Handler):

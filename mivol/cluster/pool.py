@@ -1,7 +1,7 @@
-"""Work on the workers of a Dask cluster: check them, send inputs once, repeat work of lost workers, count all of it.
+"""Work on the workers of a Dask cluster: checks, inputs sent once, repeated work of lost workers, and counts.
 
-Conventions. The owner of a run asks for work unit by unit, so only a few units are under way. A unit goes to any worker, and
-its result depends on the unit only. The pool holds one :class:`~mivol.cluster.workplace.Workplace` for each worker: calls go
+Conventions. The owner of a run asks for work unit by unit, and few units are under way. A unit goes to a free worker, and
+the result depends on the unit only. The pool holds one :class:`~mivol.cluster.workplace.Workplace` for each worker: calls go
 there without Dask's queue of tasks, which would add 10 ms to each. A lost worker gives its units back; a new worker joins after
 the same checks. All methods belong to the owner's main thread; the network has a thread of its own inside of Dask.
 """
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
     from distributed import Client
 
 MOST_LOSSES = 3
-"""Workers that a unit may lose. Work that kills its worker would go on for ever otherwise."""
+"""Workers that a unit may lose: otherwise work that kills workers would go on for ever."""
 
 SECONDS_BETWEEN_LOOKS = 1.0
 """Interval between two looks at the list of workers, while a worker with work has been silent for as long."""
 
 SECONDS_WITHOUT_LOOK = 5.0
-"""Interval between two looks while all workers answer: others may have come."""
+"""Interval between two looks for new workers while all workers answer."""
 
 SECONDS_WITHOUT_WORKERS = 60.0
-"""Time to wait for a worker after the last one was lost; a batch system may take longer to start one."""
+"""Time to wait for a worker after the last was lost; a batch system may take longer."""
 
 SHARE_OF_MEMORY = 0.5
 """Largest share of a worker's memory that inputs may take."""
@@ -52,7 +52,7 @@ class Unit:
 
     Attributes:
         key: of the caller, returned with the result.
-        function: function of a module of mivol; called in the worker with its workplace, then ``args``.
+        function: function of a module of mivol; called in the worker with the workplace, then ``args``.
         args: NumPy arrays and plain Python.
         needs: content hashes of inputs (:meth:`Pool.share`) that the worker must hold.
     """
@@ -65,7 +65,7 @@ class Unit:
 
 @dataclass
 class _Worker:
-    """A worker after its checks."""
+    """A worker after the checks."""
 
     address: str
     actor: Any
@@ -84,9 +84,9 @@ class Pool:
         workers: workers after their checks, by address.
         failures: reasons why jobs could not be submitted; grows while they start.
         lost: number of lost workers.
-        repeated: number of units that were sent again.
+        repeated: number of units sent again.
         gone: lost workers.
-        sent: bytes of inputs sent so far, over all workers.
+        sent: bytes of inputs sent, over all workers.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class Pool:
     # -- Workers -----------------------------------------------------------------------------------------------------
 
     def begin(self, check: Callable[[], None] = lambda: None) -> None:
-        """Wait for the workers, and check all of them before work begins.
+        """Wait for the workers, and check all before work begins.
 
         Args:
             check: called while waiting; may raise.
@@ -145,7 +145,7 @@ class Pool:
         )
 
     def describe_dashboard(self) -> str:
-        """Where Dask shows its workers, in words: its dashboard, or plain pages if the dashboard's library is missing."""
+        """Where Dask shows the workers, in words: the dashboard, or plain pages if the dashboard's library is missing."""
         link = self.client.dashboard_link
         if importlib.util.find_spec("bokeh") is None:
             return f"Dask's pages: {link.removesuffix('/status')}/info/main/workers.html (dashboard: pip install bokeh)"
@@ -240,7 +240,7 @@ class Pool:
         self.say(f"cluster: left out a worker that came later: {fault}")
 
     def _lose(self, address: str) -> None:
-        """Forget a lost worker, and take its units back."""
+        """Forget a lost worker, and take the units back."""
         worker = self.workers.pop(address)
         worker.actor = None
         self.gone.append(worker)
@@ -259,7 +259,7 @@ class Pool:
     # -- Inputs ------------------------------------------------------------------------------------------------------
 
     def share(self, digest: str, value: Any, size: int) -> str:
-        """Register an input of units; it goes to each worker at most once.
+        """Register an input of units, sent to each worker at most once.
 
         Args:
             digest: content hash of the input.
@@ -283,7 +283,7 @@ class Pool:
             size: bytes of arrays that go to each worker beside the registered inputs.
 
         Raises:
-            MivolError: together they are larger than half of the memory of a worker.
+            MivolError: the sum is larger than half of the memory of a worker.
         """
         total = size + sum(size for _, size in self._inputs.values())
         beside = Counter(worker.facts.host for worker in self.workers.values())
@@ -311,7 +311,7 @@ class Pool:
     # -- Work --------------------------------------------------------------------------------------------------------
 
     def run(self, units: Iterable[Unit | None], ahead: int = 2, check: Callable[[], None] = lambda: None) -> Iterator[tuple]:
-        """Yield (key, result) of units as they finish.
+        """Yield (key, result) of finished units.
 
         Args:
             units: drawn only when a worker is free; None means no unit before the next result.
@@ -439,7 +439,7 @@ class Pool:
         return found
 
     def stop_work(self) -> None:
-        """Ask all workers to stop their work at its next safe point."""
+        """Ask all workers to stop at the next safe point."""
 
         async def ask(worker: _Worker) -> None:
             with contextlib.suppress(Exception):
@@ -449,7 +449,7 @@ class Pool:
             self.client.loop.add_callback(ask, worker)
 
     def tabulate(self) -> Table:
-        """Table of all workers that took part, for a page."""
+        """Table of all workers of the run, for a page."""
         present = [(worker, "") for worker in self.workers.values()]
         rows = [
             (worker.facts.host, f"{worker.facts.pid}", f"{worker.done}", state)
@@ -483,7 +483,7 @@ def check_worker(address: str, facts: Facts, own: Facts | None = None) -> None:
     """Refuse a worker of other software than this process, with several threads, or without the variant.
 
     Raises:
-        MivolError: with the worker, what was found and expected.
+        MivolError: with the worker, the finding and the expectation.
     """
     place = f"worker {address} on {facts.host}"
     own = own or find_facts()
@@ -503,7 +503,7 @@ def check_worker(address: str, facts: Facts, own: Facts | None = None) -> None:
 
 
 def check_equal_workers(workers: dict[str, Facts]) -> None:
-    """Refuse workers whose CPUs have different vector features: compiled kernels round differently there.
+    """Refuse workers whose CPUs have different vector features, because compiled kernels round differently.
 
     Raises:
         MivolError: with a worker of the smaller group.

@@ -1,11 +1,11 @@
-"""What a viewer shows: a radiance field, Gaussians, points, a scene, photographs, or the model of a run.
+"""Subjects of the viewer: a radiance field, Gaussians, points, a scene, photographs, or the model of a run.
 
-Conventions. A subject draws the view of a pinhole as float32 values (H, W, 3) in its own colour space, and the painter turns
-them into a picture for a screen. ``space`` "srgb" means code values, "linear" means radiance. A crop is six numbers, a lower
+Conventions. A subject draws the view of a pinhole as float32 values (H, W, 3) in a colour space of its own, and the painter makes
+a picture for a screen. ``space`` "srgb" means code values, "linear" means radiance. A crop is six numbers, a lower
 and a higher corner [length].
 
-A fit runs in another process and knows of no viewer: it writes its models as always, and the viewer reads the newest one. A
-viewer of an unfinished run takes the lowest priority of the operating system, so the fit keeps its cores.
+A fit runs in another process and knows of no viewer: the fit writes models as always, and the viewer reads the newest. A
+viewer of an unfinished run takes the lowest priority of the operating system, and the fit keeps the cores.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from mivol.view.transfer import Transfer, VolumePicture
 
 @dataclass(frozen=True)
 class Look:
-    """What the sliders of the page choose.
+    """Choices of the sliders of the page.
 
     Attributes:
         exposure: exposure value; each unit doubles the light of the picture.
@@ -72,7 +72,7 @@ class Subject(ABC):
 
     Attributes:
         name: name for titles and files.
-        box: (2, 3) lower and higher corner of what is worth seeing [length].
+        box: (2, 3) lower and higher corner of the visible matter [length].
         home: first view; None: a view of the whole box.
         space: colour space of drawn values, "srgb" or "linear".
         is_noisy: whether the mean of several draws with other seeds is a better picture.
@@ -95,7 +95,7 @@ class Subject(ABC):
         """Values (H, W, 3) of the view of a pinhole."""
 
     def save_crop(self, folder: Path, box: Sequence[float]) -> Path:
-        """Write what lies inside a box into a new file of the folder, and return its path.
+        """Write the part inside a box into a new file of the folder, and return the path.
 
         Raises:
             MivolError: nothing inside, or a subject that cannot be cropped.
@@ -103,7 +103,7 @@ class Subject(ABC):
         raise MivolError(f"{self.name} cannot be cropped: convert it first (mivol convert).")
 
     def refresh(self) -> bool:
-        """Read again what has changed on disk; return whether the pictures change."""
+        """Read changed files again; return whether the pictures change."""
         return False
 
     @property
@@ -140,7 +140,7 @@ def new_file(folder: Path, stem: str, suffix: str) -> Path:
 
 
 class FieldSubject(Subject):
-    """A radiance field over its sky, or over black."""
+    """A radiance field over the fitted sky, or over black."""
 
     def __init__(self, path: Path) -> None:
         self.name, self.field, self.sky = path.stem, read_field(path), sky_beside(path)
@@ -263,7 +263,7 @@ class VolumeSubject(Subject):
 
 
 class SceneSubject(Subject):
-    """A scene of Mitsuba with its own integrator; each draw takes a sample of each pixel."""
+    """A scene of Mitsuba with the scene's integrator; each draw takes a sample of each pixel."""
 
     space, is_noisy = "linear", True
 
@@ -284,7 +284,7 @@ class SceneSubject(Subject):
 
 
 class PhotoSubject(Subject):
-    """Posed photographs: their cameras, and the points of a reconstruction if there are some."""
+    """Posed photographs: their cameras, and the points of a reconstruction, if given."""
 
     def __init__(self, path: Path, survey: PhotoSurvey | None = None) -> None:
         self.survey = survey_views(path) if survey is None else survey
@@ -322,14 +322,14 @@ def _box_of(to_world: np.ndarray) -> np.ndarray:
 # -- The subject of a path ---------------------------------------------------------------------------------------------
 
 FINAL: dict[str, Callable[[Path], Subject]] = {"gaussians.ply": GaussianSubject, "field.npz": FieldSubject}
-"""Models that a run writes at its end."""
+"""Models written by a run at the end."""
 
 PASSING: dict[str, Callable[[Path], Subject]] = {
     "gaussians_best.ply": GaussianSubject,
     "field_best.npz": FieldSubject,
     NEWEST: VolumeSubject,
 }
-"""Models that a run writes while it fits."""
+"""Models written by a run during the fit."""
 
 POLITE = 19
 """Niceness of a viewer of an unfinished run."""
@@ -345,7 +345,7 @@ def open_subject(
     defines: Mapping[str, str] | None = None,
     say: Callable[[str], None] = print,
 ) -> Subject:
-    """Find out what a path is, and prepare it for a viewer.
+    """Recognise the content of a path, and prepare the content for a viewer.
 
     Args:
         path: run folder, folder of photographs, field (.npz), Gaussians or points, volume, or scene (.xml).
@@ -409,7 +409,7 @@ def wait_for_run(folder: Path, say: Callable[[str], None]) -> Subject:
 
 
 def find_model(folder: Path) -> tuple[Path, float] | None:
-    """The newest model of a run, and its time of change; None without a model."""
+    """The newest model of a run, and the time of change; None without a model."""
     listed = [folder / volume.path for volume in read_record(folder).volumes if volume.role == "reconstruction"]
     for names in (FINAL, listed, PASSING):
         found = [(path, path.stat().st_mtime) for path in (folder / name for name in names) if path.is_file()]

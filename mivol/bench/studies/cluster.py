@@ -1,8 +1,8 @@
-"""What does a cluster cost: time of two workers over one process, overhead of a step, and a model for up to 1,000 workers?
+"""The cost of a cluster: time of two workers over one process, overhead of a step, and a model for up to 1,000 workers?
 
     mivol bench cluster
 
-Two local workers of one thread alternate with one process of one thread, on this machine. The machine may be busy, so time is
+Two local workers of one thread alternate with one process of one thread, on this machine. The machine may be busy, and time is
 processor time: for streaming units the time of the slowest worker, and at least half of the total (two cores); for steps the
 times of the slowest worker and of the owner, added. A model of the time is fitted to these figures: larger workloads scale them
 by views, pixels and voxels.
@@ -117,7 +117,7 @@ def best_workers(work: Workload, network: Network) -> int:
 
 
 def say_limit(work: Workload, network: Network) -> str:
-    """What stops the scaling, in words."""
+    """The limit of the scaling, in words."""
     best = best_workers(work, network)
     message = network.message_seconds(work.message_bytes)
     if work.streams and work.units * message >= math.ceil(work.units / best) * work.unit_seconds:
@@ -147,7 +147,7 @@ class ClusterSize(Size):
 
 
 def worker_seconds(pool: Pool) -> np.ndarray:
-    """Processor time of each worker so far [s]."""
+    """Processor time of each worker [s]."""
     ticks = []
     for worker in pool.workers.values():
         fields = Path(f"/proc/{worker.facts.pid}/stat").read_text().rpartition(")")[2].split()
@@ -272,7 +272,7 @@ STEP_SECONDS = 0.1
 
 
 class WaitingTwin:
-    """A twin whose part of a step takes a fixed time: it sleeps, so that other processes of the machine do not change it."""
+    """A twin whose part of a step takes a fixed time: a sleep, independent of other processes of the machine."""
 
     def take_state(self, state: dict[str, Any]) -> None:
         """Nothing: the time does not depend on a state."""

@@ -1,4 +1,4 @@
-"""What Mitsuba hides of its ``gridvolume``: the place, and how values between voxels are found."""
+"""The place and the interpolation of Mitsuba's ``gridvolume``, both hidden by Mitsuba."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ not fill its boundary deviates by 5e-6 of its size, a nearest-voxel filter by ab
 
 @dataclass
 class StockGrids:
-    """What is known of the grids of a scene, found once for each.
+    """Place and interpolation of the grids of a scene, each found once.
 
     Attributes:
         places: (4, 4) float64 maps of the unit cube to the world, by volume and boundary.
-        trilinear: whether a stock grid is interpolated as by mivol, by volume; without those that have not told so far.
+        trilinear: whether a stock grid is interpolated as by mivol, by volume; without undecided grids.
     """
 
     places: dict = field(default_factory=dict)
@@ -43,9 +43,9 @@ class StockGrids:
         return self.places[key]
 
     def is_trilinear(self, volume: mi.Volume, lattice: Lattice) -> bool:
-        """Whether a stock grid is trilinear between voxels, with clamped borders, like the lattice of its values.
+        """Whether a stock grid is trilinear between voxels, with clamped borders, like a lattice of the same values.
 
-        A constant grid counts as trilinear until it has other values, and every grid while ``dr.freeze`` records.
+        A constant grid counts as trilinear until the values change, and every grid while ``dr.freeze`` records.
         """
         if volume.ptr not in self.trilinear and not is_recording():
             answer = compare_look_up(volume, lattice)
@@ -59,7 +59,7 @@ def compare_look_up(volume: mi.Volume, lattice: Lattice) -> bool | None:
     """Compare values of a stock grid with trilinear values, since Mitsuba exposes neither filter nor borders.
 
     Returns:
-        Whether they agree; None if all voxels around the points are equal, or some are not finite.
+        Whether the values agree; None if all voxels around the points are equal, or some are not finite.
     """
     rng, sizes = np.random.default_rng(0), np.array(lattice.res[::-1])
     u, axis, border = rng.uniform(1e-3, 1 - 1e-3, (POINTS, 3)), rng.integers(3, size=POINTS), np.arange(POINTS // 2)
