@@ -1,7 +1,7 @@
 """Subjects of the viewer: a radiance field, Gaussians, points, a scene, photographs, or the model of a run.
 
-Conventions. A subject draws the view of a pinhole as float32 values (H, W, 3) in a colour space of its own, and the painter makes
-a picture for a screen. ``space`` "srgb" means code values, "linear" means radiance. A crop is six numbers, a lower
+Conventions. A subject draws the view of a pinhole as float32 values (H, W, 3) in a colour space of its own, and the painter
+makes a picture for a screen. ``space`` "srgb" means code values, "linear" means radiance. A crop is six numbers, a lower
 and a higher corner [length].
 
 A fit runs in another process and knows of no viewer: the fit writes models as always, and the viewer reads the newest. A
