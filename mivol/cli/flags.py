@@ -216,12 +216,13 @@ def convert_flags() -> list:
         flag("--to", choices=(*KINDS, "field", "mesh", "octree", "grid", "nested", "hash", "nerf"),
              help="kind of the output (default: as the source, if possible)"),
         flag("--resolution", type=int,
-             help="for a grid or a mesh: voxels along the longest edge (default: 128); for Gaussians from a field: Gaussians "
+             help="for a grid or a mesh: voxels along the longest edge (default: 128; 64 in each box of a nested grid); for "
+             "Gaussians from a field: Gaussians "
              "along that edge (default: one per two voxels); for an octree: leaves along the edge of its cube, a power of two "
              "(default: two per voxel)"),
         flag("--box", type=float, nargs=6, metavar=("x", "y", "z", "to_x", "to_y", "to_z"),
-             help="box of a field or a mesh (default: three standard deviations around all Gaussians), or box that crops "
-             "Gaussians or points [length]"),
+             help="box of a field or a mesh (default: three standard deviations around all Gaussians), innermost box of a "
+             "nested grid (default: around the middle half of the Gaussians), or box that crops Gaussians or points [length]"),
         MODE,
     ]  # fmt: skip
 

@@ -300,6 +300,8 @@ def _convert_cloud(arguments: argparse.Namespace) -> str:
     kind = _check_conversion(arguments)
     if kind in ("hash", "nerf"):
         return field_conversion.convert_to_network(source, target, kind, arguments.mode)
+    if kind == "nested":
+        return field_conversion.convert_to_nested(source, target, resolution, arguments.box, arguments.mode)
     if kind in ("grid", "octree"):
         make = field_conversion.convert_to_grid if kind == "grid" else field_conversion.convert_to_octree
         return make(source, target, resolution, arguments.mode)
@@ -322,10 +324,14 @@ def _check_conversion(arguments: argparse.Namespace) -> str | None:
             raise MivolError(f"{target}: --to {kind} writes an .npz, fitted to views of the source: leave out other flags.")
         return kind
     if kind == "nested":
-        raise MivolError(
-            f"{target}: no conversion makes a nested grid, whose outer boxes hold what lies around the cameras, since other "
-            "models hold nothing outside of their one box: make a grid (--to grid), which is a nested grid of one box."
-        )
+        if from_field:
+            raise MivolError(
+                f"{source}: --to nested puts what lies around a box into boxes around it, and a radiance field of one box has "
+                "nothing there: use it as it is, or make it a grid (--to grid)."
+            )
+        if not is_field:
+            raise MivolError(f"{target}: --to nested makes an .npz: give a file that ends so.")
+        return kind
     if from_field and is_field and kind not in ("grid", "octree"):
         raise MivolError(
             f"{target}: --to says what a field becomes: octree, hash or nerf, and grid for all but a grid of one box."

@@ -8,7 +8,7 @@ of their own, give the loss. Both look at the innermost box of a nested grid, th
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,7 +21,13 @@ from mivol.errors import MivolError
 from mivol.experiments.gaussian_conversion import EDGE, VIEWED, box_to_world, cameras_around, read_as_gaussians
 from mivol.fields.field_archives import read_field_view
 from mivol.fields.field_files import read_field, write_field
-from mivol.fields.gaussian_grid import gaussian_box, gaussians_to_grid, grid_to_gaussians, nested_to_gaussians
+from mivol.fields.gaussian_grid import (
+    gaussian_box,
+    gaussians_to_grid,
+    gaussians_to_nested,
+    grid_to_gaussians,
+    nested_to_gaussians,
+)
 from mivol.fields.octree import MAX_DEPTH, Octree
 from mivol.fields.resampling import GRID_NODES, sample_to_grid
 from mivol.fields.sampled_field import SampledField
@@ -51,6 +57,9 @@ from mivol.validate.metrics import psnr
 
 MOST_NODES = 256
 """Default number of nodes along the longest edge of the grid of a nested grid, whose finest voxels may need more."""
+
+NESTED_NODES = 64
+"""Default number of nodes along the longest edge of each box of a nested grid, as in fits."""
 
 LEAF_VIEWS, LEAF_EDGE = 48, 512
 """Number of views that decide which leaves are seen, and their largest edge [pixel]."""
@@ -223,6 +232,32 @@ def convert_to_grid(path: Path, target: Path, resolution: int | None, variant: s
     if isinstance(source.model, Octree):
         lines.append(describe_speed(read_field(target), source.model, path.name))
     return "\n".join(lines)
+
+
+def convert_to_nested(path: Path, target: Path, resolution: int | None, box: Sequence[float] | None, variant: str) -> str:
+    """Write Gaussians or points as a nested grid; result as :func:`convert_to_octree`.
+
+    Args:
+        path: Gaussians or points.
+        target: file ending in .npz.
+        resolution: nodes along the longest edge of each box; None means ``NESTED_NODES``.
+        box: two corners of the innermost box, six numbers [length]; None means the box of the middle half of the Gaussians
+            along each axis.
+        variant: Mitsuba variant of the views.
+
+    Raises:
+        MivolError: as :func:`mivol.fields.gaussian_grid.gaussians_to_nested`, the readers and the disk.
+    """
+    set_variant(variant)
+    source = Source.open(path)
+    low, high = np.quantile(source.model.means, [0.25, 0.75], axis=0) if box is None else np.reshape(box, (2, 3))
+    grid = gaussians_to_nested(source.model, low, high, resolution or NESTED_NODES)
+    write_field(target, grid, view=source.view)
+    loss = views_psnr(source, Source.open(target))
+    between = (
+        f"{loss:.1f} dB between views of the innermost box, in {target.name} and {path.name}: {VIEWED}, over black, peak 1"
+    )
+    return f"{target}: {grid.levels} nested boxes of {describe_nodes(grid)}\n{between}"
 
 
 def make_grid(source: Source, resolution: int | None = None) -> SphericalGrid:

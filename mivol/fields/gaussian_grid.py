@@ -45,7 +45,7 @@ from scipy.special import elliprg
 
 from mivol.errors import MivolError
 from mivol.fields.gaussian_field import MAX_CHUNK_PAIRS, MAX_OPACITY, find_chunk_starts, list_box_nodes
-from mivol.fields.spherical_grid import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
 from mivol.files import encode_srgb
 from mivol.machine import check_memory
 from mivol.points.gaussians import CONSTANT_HARMONIC, HIGHEST_DEGREE, ROW_SHAPES, Gaussians
@@ -109,6 +109,35 @@ def gaussians_to_grid(gaussians: Gaussians, low: np.ndarray, high: np.ndarray, r
     return SphericalGrid.from_dense(
         density, harmonics.reshape(*shape, -1, 3), to_world, occupied.reshape(shape), activation="none", space="srgb"
     )
+
+
+MOST_LEVELS = 8
+"""Largest number of nested boxes: the outermost one is 128 times as large as the innermost one."""
+
+
+def gaussians_to_nested(gaussians: Gaussians, low: np.ndarray, high: np.ndarray, resolution: int) -> SphericalGrid:
+    """Deposit Gaussians on nested grids: boxes of twice the extent each, until one holds all Gaussians.
+
+    Args:
+        gaussians: as :func:`gaussians_to_grid`.
+        low, high: (3,) corners of the innermost box [length].
+        resolution: voxels along the longest edge of each box.
+
+    Returns:
+        A nested field of at most ``MOST_LEVELS`` boxes; parts outside of the outermost one are cut off.
+
+    Raises:
+        MivolError: as :func:`gaussians_to_grid`, for the innermost box or the memory.
+    """
+    low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
+    middle, half, ends = (low + high) / 2, (high - low) / 2, gaussian_box(gaussians)
+    grids = [gaussians_to_grid(gaussians, low, high, resolution)]
+    while len(grids) < MOST_LEVELS and any((abs(end - middle) > half).any() for end in ends):
+        half = 2 * half
+        grids.append(gaussians_to_grid(gaussians, middle - half, middle + half, resolution))
+    nested = SphericalGrid.from_levels(grids)
+    covered = is_covered_by_inner(dr.arange(mi.UInt32, nested.node_count), nested.res)
+    return nested.select_nodes(~np.array(covered))
 
 
 def _deposit(gaussians: Gaussians, centres: np.ndarray, size: np.ndarray, voxel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

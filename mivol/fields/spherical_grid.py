@@ -229,7 +229,7 @@ class SphericalGrid:
             raise MivolError(f"a density of {density.min()} was given; without an activation none may be negative: use relu.")
         width, vacuum = row_width(sh.shape[1]), nodes is not None
         rows = np.zeros((len(density) + vacuum, width), np.float32)
-        rows[: len(density), : 3 * sh.shape[1]] = sh.reshape(len(density), -1)
+        rows[: len(density), : 3 * sh.shape[1]] = sh.reshape(len(density), 3 * sh.shape[1])
         flat = np.append(density, np.float32(function.vacuum)) if vacuum else density
         # Dr.Jit reads NumPy's memory in place, and gathers rows as packets only from aligned memory.
         packed = mi.Float(copy_aligned(np.ascontiguousarray(flat))), mi.Float(copy_aligned(rows.reshape(-1)))

@@ -15,6 +15,7 @@ from mivol.fields.gaussian_grid import (
     gaussian_box,
     gaussian_masses,
     gaussians_to_grid,
+    gaussians_to_nested,
     grid_to_gaussians,
 )
 from mivol.fields.spherical_grid import SphericalGrid
@@ -98,6 +99,18 @@ def test_a_gaussian_on_a_face_gives_half_of_its_mass() -> None:
     gaussians = one((0.5, 0.5, 0.5), mean=(2, 0, 0))
     field = gaussians_to_grid(gaussians, np.full(3, -2.1), np.array([2.0, 2.1, 2.1]), 16)
     assert total(field) == pytest.approx(0.5 * gaussian_masses(gaussians)[0], rel=1e-3)  # 4 deviations: 2e-4
+
+
+def test_nested_boxes_hold_what_lies_far_away() -> None:
+    """Boxes double until one of them holds a Gaussian 24 away. Each mass is stored once, in the first box that holds it."""
+    near, far = one((0.05, 0.05, 0.05), mean=(0.1, 0, 0)), one((0.5, 0.5, 0.5), mean=(0, 24, 0))
+    field = gaussians_to_nested(concatenate([near, far]), np.full(3, -1.0), np.full(3, 1.0), 24)
+    found = [total(field.extract_level(level)) for level in range(field.levels)]
+    expected = [gaussian_masses(near)[0], 0, 0, 0, 0, gaussian_masses(far)[0]]
+    assert found == pytest.approx(expected, rel=1e-5)  # sums of a thousand float32 densities
+    beyond = gaussians_to_nested(concatenate([near, one(mean=(0, 1e5, 0))]), np.full(3, -1.0), np.full(3, 1.0), 8)
+    assert beyond.levels == 8 and total(beyond.extract_level(0)) == pytest.approx(expected[0], rel=1e-5)
+    assert_refused("none of the Gaussians reaches", gaussians_to_nested, far, np.full(3, -1.0), np.full(3, 1.0), 24)
 
 
 def test_parts_of_a_set_and_the_set_are_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -80,6 +80,7 @@ def sources(variant_rgb: str, small: None, tmp_path: Path) -> Path:
     [
         ("cloud.ply", "octree"),
         ("cloud.ply", "grid"),
+        ("cloud.ply", "nested"),
         ("nested.npz", "octree"),
         ("nested.npz", "grid"),
         ("nested.npz", "gaussians"),
@@ -126,8 +127,8 @@ def test_an_octree_has_leaves_that_many_fine_views_see(variant_rgb: str) -> None
         ("grid.npz", "a.ply", ["--to", "hash"], "--to hash writes an .npz, fitted to views of the source"),
         ("grid.npz", "a.npz", ["--to", "hash", "--resolution", "4"], "leave out other flags"),
         ("radiance.npz", "a.npz", ["--to", "nerf"], "has colours of radiance"),
-        ("grid.npz", "a.npz", ["--to", "nested"], "no conversion makes a nested grid"),
-        ("cloud.ply", "a.npz", ["--to", "nested"], "no conversion makes a nested grid"),
+        ("grid.npz", "a.npz", ["--to", "nested"], "a radiance field of one box has nothing there"),
+        ("cloud.ply", "a.ply", ["--to", "nested"], "--to nested makes an .npz"),
         ("cloud.ply", "a.npz", ["--to", "octree", "--box", *"000111"], "crop them first"),
         ("cloud.ply", "a.ply", ["--to", "octree"], "--to octree makes an .npz"),
         ("nested.npz", "a.npz", ["--to", "octree", "--resolution", "4096"], "at most 7 is expected"),
