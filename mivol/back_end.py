@@ -100,12 +100,26 @@ def _free_gpu_memory() -> int | None:
     return gpu.free if gpu is not None and gpu.total else None
 
 
-def check_memory(needed: float, what: str, way_out: str | Callable[[float], str], limit: float | None = None) -> None:
-    """Refuse a task whose arrays need more than :func:`free_memory`; arguments as of :func:`mivol.machine.check_memory`.
+def check_memory(
+    needed: float,
+    what: str,
+    way_out: str | Callable[[float], str],
+    limit: float | None = None,
+    on_gpu: float | None = None,
+) -> None:
+    """Refuse a task whose arrays need more than :func:`free_memory`.
+
+    Args:
+        needed, what, way_out, limit: as of :func:`mivol.machine.check_memory`.
+        on_gpu: memory on a GPU [bytes], if ``needed`` counts arrays of this machine. With the variant of a GPU, both are
+            compared with their own free memory. None: all of ``needed`` is on the GPU.
 
     Raises:
         MivolError: the task needs more than the free memory.
     """
+    if limit is None and on_gpu is not None and is_on_gpu():
+        machine.check_memory(needed, what, way_out)
+        needed = on_gpu
     free = free_memory() if limit is None else limit
     if free is not None:
         machine.check_memory(needed, f"{what} on the GPU" if is_on_gpu() else what, way_out, free)

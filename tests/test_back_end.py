@@ -1,4 +1,4 @@
-"""The back end: flags for a GPU, garbage, limits of Dr.Jit, and plugins for each variant, in whichever order it becomes active.
+"""The back end: flags and memory of a GPU, garbage, limits of Dr.Jit, and plugins for each variant, in whichever order it becomes active.
 
 The limits are those that the code goes around: "gone" asks for simpler code. For the plugins the package is copied, and its
 shells replaced by ones that only say for which variant they are run; each order of imports is a process of its own.
@@ -9,15 +9,25 @@ from __future__ import annotations
 import gc
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
+import mitsuba as mi
+import numpy as np
 import pytest
 
 import mivol
-from mivol import plugins
+from mivol import back_end, machine, plugins
+from mivol.errors import MivolError
+from mivol.experiments import solver_choice, start
+from mivol.fields.gaussian_grid import _check_grid_memory
+from mivol.fields.octree import Octree
+from mivol.optim.photographs.octree_building import _check_leaves
+from mivol.scene.sensors import check_film
 from mivol.threads import run_child
+from mivol.tomography.geometry import VoxelGrid
 
 
 @pytest.fixture
@@ -32,6 +42,56 @@ def test_a_variant_of_a_gpu_spills_to_local_memory(spills: None, variant: str, e
     """Where a variant becomes active, kernels that call plugins would abort ptxas otherwise."""
     mivol._on_variant_change(None, variant)
     assert dr.flag(dr.JitFlag.SpillToSharedMemory) == expected
+
+
+# -- Memory of a card, which is made up --------------------------------------------------------------------------------
+
+
+def check_film_of_a_megapixel() -> None:
+    check_film(mi.load_dict({"type": "perspective", "film": {"type": "hdrfilm", "width": 1024, "height": 1024}}), 1)
+
+
+def check_scan() -> None:
+    settings = SimpleNamespace(solve=SimpleNamespace(solver="pcg"))
+    solver_choice.check_grid(settings, VoxelGrid((20, 30, 40)), rays=1000)
+
+
+def make_grid_of_an_octree() -> None:
+    codes, sizes = np.arange(7, dtype=np.uint64) * 8**3, np.array([3] * 6 + [0], np.uint8)
+    Octree.from_rows(6, np.eye(4), codes, sizes, np.ones(7), np.zeros((7, 9, 3))).to_grid()
+
+
+TASKS: dict[str, tuple[Callable[[], None], int]] = {
+    "a film": (check_film_of_a_megapixel, 36 << 20),
+    "a scan": (check_scan, 20 * 24000 + (8 + 28) * 1000),
+    "a grid of a scene": (lambda: start.check_grid("sigma_t.data", (100, 100, 100), "less"), 24 * 10**6),
+    "leaves": (lambda: _check_leaves(10**6, 8), 36 * 10**6),
+    "the grid of an octree": (make_grid_of_an_octree, (6 * 8**3 + 1) * 4 * (2 + 3 * 9)),
+    "the grid of Gaussians": (lambda: _check_grid_memory(np.array([50, 40, 30]), 4, 50), 60000 * 4 * (2 + 3 * 4)),
+}
+"""Tasks with arrays on a GPU, and their memory there [byte]."""
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_memory_of_a_card_is_asked_before_a_task(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One byte less than the arrays on the card is refused; the memory of the machine is another question."""
+    task, needed = TASKS[name]
+    monkeypatch.setattr(back_end, "is_on_gpu", lambda: True)
+    monkeypatch.setattr(machine, "available_memory", lambda: 1 << 40)
+    monkeypatch.setattr(back_end, "_free_gpu_memory", lambda: needed)
+    task()
+    monkeypatch.setattr(back_end, "_free_gpu_memory", lambda: needed - 1)
+    with pytest.raises(MivolError, match=r"on the GPU needs .* GiB of memory and .* GiB are free: "):
+        task()
+
+
+@pytest.mark.parametrize("name", [name for name in TASKS if name != "a grid of a scene"])
+def test_a_large_card_needs_a_machine_beside_it(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(back_end, "is_on_gpu", lambda: True)
+    monkeypatch.setattr(machine, "available_memory", lambda: 1 << 19)
+    monkeypatch.setattr(back_end, "_free_gpu_memory", lambda: 1 << 40)
+    with pytest.raises(MivolError, match=r"^((?!GPU).)* needs .* GiB of memory and 0\.0 GiB are free: "):
+        TASKS[name][0]()
 
 
 # -- Garbage -----------------------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ truth is known. Held-out views are predicted at the end.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -230,7 +231,7 @@ def make_projector(settings: config.ScanExperiment, data: Projections, grid: Vox
         MivolError: more unknowns than memory.
     """
     unknowns = subdivide_grid(grid, settings.solve.supersampling, data.geometry)
-    check_grid(settings, unknowns)
+    check_grid(settings, unknowns, math.prod(data.geometry.shape))
     return Projector(data.geometry, unknowns)
 
 

@@ -15,10 +15,10 @@ import msgspec
 import numpy as np
 
 from mivol import config
+from mivol.back_end import check_memory
 from mivol.config import AUTO
 from mivol.errors import MivolError
 from mivol.experiments.projections import Projections
-from mivol.machine import check_memory
 from mivol.optim.projections.inversion import ALL_SOLVERS, DIRECT, ProjectionProblem
 from mivol.optim.projections.iterative import projected_cg
 from mivol.optim.projections.linear_problems import (
@@ -31,7 +31,7 @@ from mivol.optim.projections.linear_problems import (
 from mivol.report.record import PlanLine
 from mivol.tomography.filtered import check_directions
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid, subdivide_grid
-from mivol.tomography.projector import Projector
+from mivol.tomography.projector import Projector, count_product_bytes
 from mivol.tomography.stored import is_worth_storing, matrix_bytes, store_matrix
 
 MOST_UNKNOWNS = 1 << 24
@@ -142,15 +142,21 @@ FIELDS, FIELDS_OF_ONE_STEP = 10, 3
 """Fields of 4-byte numbers, one per unknown, in an iterative and in a direct solver."""
 
 
-def check_grid(settings: config.ScanExperiment, grid: VoxelGrid) -> None:
-    """Refuse unknowns beyond the memory.
+def check_grid(settings: config.ScanExperiment, grid: VoxelGrid, rays: int = 0) -> None:
+    """Refuse unknowns beyond the memory of this machine, where solvers keep their fields, or of the GPU that takes products.
+
+    Args:
+        settings: of the run.
+        grid: the unknowns.
+        rays: number of rays; 0 before the scan is read.
 
     Raises:
         MivolError: with their number.
     """
     fields = FIELDS_OF_ONE_STEP if settings.solve.solver in DIRECT else FIELDS
     subject = f"a reconstruction of {' x '.join(str(n) for n in grid.shape)} unknowns"
-    check_memory(4 * fields * math.prod(grid.shape), subject, "give grid.shape fewer voxels, or set solve.supersampling = 1")
+    way_out, product = "give grid.shape fewer voxels, or set solve.supersampling = 1", count_product_bytes(grid.size, rays)
+    check_memory(4 * fields * grid.size, subject, way_out, on_gpu=product)
 
 
 BY_SUBSETS = ("sart", "os-sart")

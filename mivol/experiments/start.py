@@ -34,13 +34,13 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from mivol.back_end import check_memory
 from mivol.config import SceneExperiment, Sought
 from mivol.errors import MivolError
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_volume
 from mivol.files.fetch import resolve_path as place_in
 from mivol.files.image_files import encode_srgb
-from mivol.machine import check_memory
 from mivol.optim.events import Upsample, check_for_grids
 from mivol.optim.loop import begin_fit
 from mivol.optim.optimizer import Optimizer

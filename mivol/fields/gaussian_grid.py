@@ -43,11 +43,11 @@ from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 from scipy.special import elliprg
 
+from mivol.back_end import check_memory
 from mivol.errors import MivolError
 from mivol.fields.gaussian_field import MAX_CHUNK_PAIRS, MAX_OPACITY, find_chunk_starts, list_box_nodes
 from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
 from mivol.files import encode_srgb
-from mivol.machine import check_memory
 from mivol.points.gaussians import CONSTANT_HARMONIC, HIGHEST_DEGREE, ROW_SHAPES, Gaussians
 
 DEPOSIT_REACH = 4.0
@@ -175,7 +175,9 @@ def _check_grid_memory(size: np.ndarray, basis: int, resolution: int) -> None:
         fitting = int(resolution * max((free - pairs) / (needed - pairs), 0) ** (1 / 3))
         return f"a resolution of at most {fitting} fits"
 
-    check_memory(needed, f"a grid of {size[0]} x {size[1]} x {size[2]} nodes and {basis} harmonics", advise)
+    # A GPU holds the row, the density and the coefficients of each node, and no pairs: the advice is on the safe side.
+    on_gpu = 4 * (2 + 3 * basis) * int(np.prod(size))
+    check_memory(needed, f"a grid of {size[0]} x {size[1]} x {size[2]} nodes and {basis} harmonics", advise, on_gpu=on_gpu)
 
 
 TENT_VARIANCE = 1 / 6

@@ -23,12 +23,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.back_end import check_memory
 from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.fields.harmonics import SPACES, basis_size, harmonic_degree, local_frame, rotate_direction, row_width
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.kernel_recording import copy_aligned
-from mivol.machine import check_memory
 from mivol.space import check_affine
 
 __all__ = ["COLOUR_MAPS", "MAX_DEPTH", "MAX_LEAVES", "Octree", "interleave", "separate"]
@@ -267,7 +267,8 @@ class Octree:
                 "keep it as an octree."
             )
         needed = int(counts.sum()) * (PLACE_BYTES + 3 * 4 * 3 * self.basis)  # three copies of the coefficients
-        check_memory(needed, f"a grid of an octree of {counts.sum()} cells", "keep it as an octree")
+        on_gpu = int(counts.sum()) * 4 * (2 + 3 * self.basis)  # row, density and coefficients of a node
+        check_memory(needed, f"a grid of an octree of {counts.sum()} cells", "keep it as an octree", on_gpu=on_gpu)
         owner = np.repeat(np.arange(self.leaves), counts)
         within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
         first = self.codes >> np.uint64(3 * smallest)

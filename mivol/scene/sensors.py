@@ -20,9 +20,9 @@ import mitsuba as mi
 import msgspec
 import numpy as np
 
+from mivol.back_end import check_memory
 from mivol.errors import MivolError
 from mivol.files.source import refusal
-from mivol.machine import check_memory
 from mivol.photos import Camera, intrinsics
 from mivol.photos.camera import PIXELS_LOST
 from mivol.scene_graph import traverse
@@ -70,7 +70,7 @@ def check_film(sensor: mi.Sensor, kept: int = 0) -> None:
     if needed < SMALL_FILM:
         return
     what, way_out = f"a film of {width} x {height} pixels", "give it fewer pixels, or render it in crops"
-    check_memory(needed, what, way_out)
+    check_memory(needed, what, way_out, on_gpu=PIXEL_BYTES * width * height)
     if FILM_NUMBERS * width * height >= MOST_ENTRIES:
         raise MivolError(f"{what} has more numbers than Dr.Jit can count in one array (2^32): {way_out}.")
 

@@ -70,6 +70,13 @@ CACHE_BYTES = 1 << 30
 """Largest size of rays kept between calls [byte]; larger sets are built anew in each call."""
 
 
+def count_product_bytes(voxels: int, rays: int) -> int:
+    """Memory of the arrays of ``A @ x`` and ``A.T @ y`` [byte]: of a voxel, a number and two float64 sums over passes; of a
+    ray, two numbers and its kept place.
+    """
+    return 20 * voxels + 8 * rays + min(RAY_BYTES * rays, CACHE_BYTES)
+
+
 class RayPass(NamedTuple):
     """Rays of a kernel.
 

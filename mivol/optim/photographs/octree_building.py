@@ -22,13 +22,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.back_end import check_memory
 from mivol.errors import MivolError
 from mivol.fields.harmonics import local_frame
 from mivol.fields.octree import MAX_DEPTH, MAX_LEAVES, Octree, check_depth, interleave, separate
 from mivol.fields.resampling import project_colours, sample_voxels
 from mivol.fields.sampled_field import SampledField
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.machine import check_memory
 from mivol.space import place_grid
 from mivol.transport.line_integrals.leaf_radiance import LeafColours, raise_leaf_weights
 from mivol.transport.line_integrals.radiance_field import RayBundle
@@ -195,12 +195,16 @@ LEAF_BYTES = 200
 """Memory of a leaf while an octree is made [bytes]: its cell, code and order, values without colours, and weight."""
 
 
+LEAF_BYTES_ON_GPU = 4 * (3 + 1 + 4 + 1)
+"""The same on a GPU: place, mean extinction, and in all views the packed values and the weight."""
+
+
 def _check_leaves(count: int, depth: int) -> None:
     """Refuse more leaves than an octree or the memory holds."""
     wanted = f"an octree of {count} leaves at depth {depth}"
     if count > MAX_LEAVES:
         raise MivolError(f"{wanted} was asked for; at most {MAX_LEAVES} are expected: choose a smaller depth.")
-    check_memory(LEAF_BYTES * count, wanted, "choose a smaller depth")
+    check_memory(LEAF_BYTES * count, wanted, "choose a smaller depth", on_gpu=LEAF_BYTES_ON_GPU * count)
 
 
 def _check_grid(grid: SphericalGrid, recipe: OctreeRecipe) -> int:
