@@ -1,4 +1,4 @@
-"""The back end: flags and memory of a GPU, garbage, limits of Dr.Jit, and plugins for each variant, in whichever order it becomes active.
+"""The back end: flags and memory of a GPU, garbage, limits of Dr.Jit, and plugins for each variant in any order.
 
 The limits are those that the code goes around: "gone" asks for simpler code. For the plugins the package is copied, and its
 shells replaced by ones that only say for which variant they are run; each order of imports is a process of its own.
