@@ -5,7 +5,7 @@ r"""The slow, obvious twins of emission: the light that media send along a ray, 
 
 Conventions. Those of tests/oracle.py. A field is a number, an rgb triple, or a (grid, to_world) pair, which is 0 outside its
 box. :func:`radiance` is the integral itself, to 1e-10; :func:`cell_radiance` is what the rule of
-mivol/transport/traversal/cell_quadrature.py makes of it, cell by cell, so that its derivatives may be had by differences.
+mivol/transport/traversal/interpolation.py makes of it, cell by cell, so that its derivatives may be had by differences.
 
 Nothing here knows Dr.Jit, Mitsuba or mivol.
 """

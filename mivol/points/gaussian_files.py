@@ -8,7 +8,7 @@ A page is one HTML file that shows Gaussians in any browser with WebGL 2, withou
 degree 0 in 16 bits over their range; quaternions (w, x, y, z) in 16 bits and a sign; opacities in 8 bits; higher harmonics as
 128 + 127 k / span in 8 bits.
 
-Own readers, by :mod:`mivol.files.ply` and :mod:`mivol.files.gltf`: plyfile is under the GPL, and pygltflib 1.16 leaves the
+Own readers, by :mod:`mivol.files.ply` and :mod:`mivol.files.mesh`: plyfile is under the GPL, and pygltflib 1.16 leaves the
 arrays of the extension to the caller.
 
 PLY. The format of 3D Gaussian splatting holds the pre-images of the activations, one property each. Properties are written in
@@ -49,7 +49,7 @@ import numpy as np
 from mivol.errors import MivolWarning
 from mivol.files import ply
 from mivol.files.atomic import write_whole
-from mivol.files.gltf import GlbWriter, read_accessor, read_glb
+from mivol.files.mesh import GlbWriter, read_accessor, read_glb
 from mivol.files.ply import read_comments, read_layout, read_tables
 from mivol.files.source import check_file, parse_reals, refusal, select_by_suffix
 from mivol.photos.camera_path import HomeView

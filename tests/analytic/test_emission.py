@@ -18,7 +18,7 @@ from mivol.transport.estimators.segment import PathSegment
 from mivol.transport.line_integrals.emission import MAX_PARTS, Emission, count_parts, voxel_to_cell_ratio
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.cell_quadrature import share_opacity, weigh_emission_density
+from mivol.transport.traversal.interpolation import share_opacity, weigh_emission_density
 from mivol.transport.traversal.lattice import Lattice
 from scenes import FRAMES, as_float32, ball_of, box_of, camera, centred, media_of
 

@@ -21,7 +21,7 @@ from scattering_scenes import PLACE, aimed, assert_twin, fog, mivol, pencils, po
 
 import scenes
 from mivol.transport.estimators.single_scattering.distance_sampling import MediumEvent
-from mivol.transport.estimators.single_scattering.scattering_derivatives import (
+from mivol.transport.estimators.single_scattering.single_scattering import (
     Scattering,
     event_coefficients,
     event_interaction,

@@ -25,9 +25,8 @@ from scipy.spatial import cKDTree
 
 from mivol.experiments.render import make_camera
 from mivol.fields.surfaces import interpolate_corners
-from mivol.files.gltf import read_accessor, read_glb, turn_to_y
 from mivol.files.image_files import decode_srgb
-from mivol.files.mesh import Atlas, Mesh, write_mesh
+from mivol.files.mesh import Atlas, Mesh, read_accessor, read_glb, turn_to_y, write_mesh
 from mivol.photos.camera_path import HomeView
 from mivol.points import Gaussians
 from mivol.points.gaussian_files import GAUSSIAN_WRITERS, read_gaussians, turn, write_gaussians

@@ -17,8 +17,7 @@ from mivol.experiments import gaussian_fit as outputs
 from mivol.experiments.film import Film
 from mivol.experiments.fit_kind import NullProgress
 from mivol.fields.surfaces import DepthView, interpolate_corners
-from mivol.files.gltf import read_glb, turn_to_y
-from mivol.files.mesh import Atlas, Mesh
+from mivol.files.mesh import Atlas, Mesh, read_glb, turn_to_y
 from mivol.photos import Camera, pixel_centres, rays
 from mivol.photos.camera import project
 from mivol.photos.camera_path import HomeView

@@ -7,7 +7,7 @@ Le. With ``sigma_a`` and ``sigma_s`` the emitted power is sigma_a Le. The emissi
 depend on the extinction.
 
 Conventions. :mod:`mivol.transport.line_integrals.composite` composites a ray cell by cell. Source function and emission density
-are evaluated at the two points of the cell quadrature (:mod:`mivol.transport.traversal.cell_quadrature`). Cells belong to the
+are evaluated at the two points of the cell quadrature (:mod:`mivol.transport.traversal.interpolation`). Cells belong to the
 grid of the extinction, or to the grid of the emission if the extinction has no grid; an interval outside all grids is one cell.
 A cell is cut into equal parts where the voxels of emission or albedo are smaller, or where their box ends inside of cells.
 ``omega`` is the direction from the point to the camera (``wi``).
@@ -37,8 +37,14 @@ from mivol.transport.media.medium_view import MediumView
 from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.media.ray_intervals import RaySegment, find_end
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.cell_quadrature import share_opacity, weigh_emission_density
-from mivol.transport.traversal.interpolation import GAUSS_POINT, eval_cubic, fit_cubic, integrate_cubic
+from mivol.transport.traversal.interpolation import (
+    GAUSS_POINT,
+    eval_cubic,
+    fit_cubic,
+    integrate_cubic,
+    share_opacity,
+    weigh_emission_density,
+)
 from mivol.transport.traversal.random_numbers import SpreadSampler
 
 __all__ = ["integrate_emission", "vjp_emission", "Emission"]

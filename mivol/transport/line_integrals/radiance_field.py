@@ -3,7 +3,7 @@ r"""Emission-absorption rendering of a radiance field along rays, and its deriva
 .. math:: L = \sum_i T_i\, S_i, \qquad T_{i+1} = T_i e^{-\tau_i}, \qquad S_i = \alpha_i \big( f c_1 + (1 - f) c_2 \big)
 
 The sum runs over the occupied cells of a ray, with the fractions f of the cell quadrature
-(:mod:`mivol.transport.traversal.cell_quadrature`). It has fourth order in the size of a cell, and is exact for a constant
+(:mod:`mivol.transport.traversal.interpolation`). It has fourth order in the size of a cell, and is exact for a constant
 colour.
 
 Conventions. Density and colour are interpolated between nodes; then the activation acts on the density, and the clamp at 0 on
@@ -32,8 +32,7 @@ import mitsuba as mi
 from mivol.fields.activation import Activation
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_source import CellValues, Source
-from mivol.transport.traversal.cell_quadrature import share_opacity
-from mivol.transport.traversal.interpolation import GAUSS_POINT, interpolate, trilinear_weights
+from mivol.transport.traversal.interpolation import GAUSS_POINT, interpolate, share_opacity, trilinear_weights
 from mivol.transport.traversal.lattice import Segment
 from mivol.transport.traversal.occupied_cells import OccupiedCells, RayOrder
 from mivol.transport.traversal.occupied_walk import (

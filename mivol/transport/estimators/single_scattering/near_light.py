@@ -42,7 +42,7 @@ from mivol.transport.estimators.single_scattering.distance_sampling import (
     sample_distance,
     start_reservoir,
 )
-from mivol.transport.estimators.single_scattering.scattering_derivatives import (
+from mivol.transport.estimators.single_scattering.single_scattering import (
     ScatteredLight,
     Scattering,
     event_coefficients,

@@ -32,7 +32,7 @@ from scattering_gradients import (
 from scattering_scenes import PLACE, Pencils, aimed, fog, mivol, pencils, point, rough_grid, smoke, spot, sun
 
 import scenes
-from mivol.transport.estimators.single_scattering.scattering_derivatives import _choose_shadow_ray
+from mivol.transport.estimators.single_scattering.single_scattering import _choose_shadow_ray
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.validate.statistics import Moments
 from scenes import as_float32, box_of, centred, grid_volume, medium
