@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from oracle_radiance import ACTIVATIONS as APPLY
 from oracle_radiance import ROOT3, Twin, shares
-from radiance_rays import CUBE, see
+from radiance_rays import see
+from sampled_fields import CUBE
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from mivol.fields import activation

@@ -6,7 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from radiance_rays import CUBE, TO_WORLD, aim, derive, make, rays_of, see
+from radiance_rays import TO_WORLD, aim, derive, make, rays_of, see
+from sampled_fields import CUBE
 
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.kernel_recording import ALIGNMENT

@@ -7,8 +7,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from oracle_radiance import NestedTwin, Twin, sh_basis
-from radiance_rays import CUBE, TO_WORLD, derive, followed, make, rays_of, see
+from radiance_rays import TO_WORLD, derive, followed, make, rays_of, see
 from refusals import assert_refused
+from sampled_fields import CUBE
 
 from mivol.fields.harmonics import local_frame
 from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner

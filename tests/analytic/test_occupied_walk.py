@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
-from radiance_rays import CUBE
+from sampled_fields import CUBE
 
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import find_occupied_cells

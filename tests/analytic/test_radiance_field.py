@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from oracle_radiance import Twin
-from radiance_rays import CUBE, TO_WORLD, aim, derive, looked, make, rays_of, see
+from radiance_rays import TO_WORLD, aim, derive, looked, make, rays_of, see
+from sampled_fields import CUBE
 
 from mivol.fields.activation import ACTIVATIONS
 from mivol.fields.spherical_grid import SphericalGrid

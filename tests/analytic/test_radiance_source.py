@@ -5,7 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-from radiance_rays import CUBE, TO_WORLD, make, rays_of, see
+from radiance_rays import TO_WORLD, make, rays_of, see
+from sampled_fields import CUBE
 
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import RayGradient, find_occupied_cells, make_model, render_rays, vjp_rays

@@ -11,7 +11,8 @@ import pytest
 from emission_scenes import changes, colours, gradients
 from oracle import box_interval
 from oracle_radiance import Twin
-from radiance_rays import CUBE, TO_WORLD, aim, derive, followed, rays_of, see
+from radiance_rays import TO_WORLD, aim, derive, followed, rays_of, see
+from sampled_fields import CUBE
 from scattering_scenes import Pencils, pencils
 from scipy.special import lpmv
 
