@@ -12,7 +12,6 @@ from mivol.transport.media.compositing import (
     ReverseState,
     composite_over,
     pass_cell,
-    transmittance_of,
 )
 
 PIECES = [(0.5, 2.0), (1.5, 0.25), (0.1, 4.0)]
@@ -62,7 +61,3 @@ def test_a_reverse_sweep_finds_what_each_piece_adds() -> None:
         assert by_tau == pytest.approx((seen[0] - seen[1]) / (2 * h), rel=1e-4)
         assert by_N == pytest.approx(weight * np.exp(-front - sum(tau for tau, _ in PIECES[:k])), rel=1e-6)
     assert float(state.ahead[0][0]) == pytest.approx(front, abs=1e-6)
-
-
-def test_a_depth_that_rounding_left_below_0_lets_all_through() -> None:
-    assert float(transmittance_of(mi.Float64(-1e-9))[0]) == 1.0

@@ -28,7 +28,7 @@ from mivol.optim.priors import Laplacian, TotalVariation
 from mivol.optim.scenes import scene_problem
 from mivol.optim.scenes.scene_problem import SceneProblem, draw_views
 from mivol.optim.scenes.views import View, derive_seed, make_batches
-from mivol.optim.second_order import GaussNewton, Lbfgs, Packing, apply_inverse_hessian, conjugate_gradients
+from mivol.optim.second_order import GaussNewton, Lbfgs, Packing, conjugate_gradients
 from mivol.validate.statistics import Moments
 
 EPS = float(np.finfo(np.float32).eps)
@@ -171,20 +171,6 @@ def test_conjugate_gradients_solve(variant_rgb) -> None:
     b = rng.standard_normal(6)
     x = conjugate_gradients(lambda d: a @ d, b, np.diag(a).copy(), 12)
     assert np.allclose(a @ x, b, atol=1e-6 * np.abs(b).max())
-
-
-def test_two_loops_are_the_inverse_hessian(variant_rgb) -> None:
-    """The secant equation H y = s holds exactly for the newest pair, whatever the older ones; H is symmetric, and with as
-    many conjugate pairs as dimensions it is the inverse of the Hessian."""
-    rng = np.random.default_rng(0)
-    a = np.diag(rng.uniform(1, 5, 7))
-    steps = [rng.standard_normal(7) for _ in range(3)]
-    changes = [a @ s for s in steps]
-    assert np.allclose(apply_inverse_hessian(changes[-1], steps, changes), steps[-1], rtol=1e-12)
-    v, w = rng.standard_normal((2, 7))
-    assert np.isclose(apply_inverse_hessian(v, steps, changes) @ w, apply_inverse_hessian(w, steps, changes) @ v, rtol=1e-12)
-    conjugate = list(np.eye(7))
-    assert np.allclose(apply_inverse_hessian(v, conjugate, [a @ s for s in conjugate]), np.linalg.solve(a, v), rtol=1e-12)
 
 
 # -- Randomness, passes, batches ---------------------------------------------------------------------------------
