@@ -24,8 +24,8 @@ import mivol
 from mivol.fields.procedural import make_procedural
 from mivol.files import read_volume, write_volume
 from mivol.files.fetch import PREFIX, find_local_file, resolve_path
-from mivol.optim.projections.linear_problems import LeastSquares
 from mivol.optim.projections.inversion import SOLVERS
+from mivol.optim.projections.linear_problems import LeastSquares
 from mivol.validate.metrics import nrmse
 
 import mitsuba as mi
