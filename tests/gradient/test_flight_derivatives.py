@@ -215,7 +215,7 @@ LAMPS = {
 @pytest.mark.parametrize(
     ("lamp", "kind", "depth"),
     [("point", "density", 3), ("point", "albedo", 8), ("spot", "density", 8), ("spot", "g", 3), ("area", "density", 3),
-     ("area", "homogeneous", 8)],
+     ("area", "homogeneous", 8), ("inside", "density", 3)],
 )  # fmt: skip
 def test_near_light_by_differences(lamp, kind, depth):
     """Half of the voxels are empty. The truncation error is that of :func:`test_density_by_differences`; along a uniform
