@@ -41,6 +41,19 @@ def record_kernels(function: Callable, *settings: Any) -> Callable:
     return dr.freeze(lambda *given: function(*settings, *given))
 
 
+def begin_kernel(*inputs: Any) -> None:
+    """Evaluate arrays, and let the code that follows begin a kernel of its own.
+
+    Two kernels that compute the same from arrays in memory have the same instructions, so Dr.Jit compiles them once. The new
+    scope keeps them from using constants of earlier code, which would change the order of the instructions.
+
+    Args:
+        inputs: arrays, or data classes of arrays.
+    """
+    dr.eval(inputs)
+    dr.detail.new_scope(dr.backend_v(mi.Float))
+
+
 class CannotRecordError(Exception):
     """Dr.Jit cannot record a task. The task has run in part: gradients may have been added."""
 

@@ -65,6 +65,7 @@ from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.successive import walk_branching
 from mivol.transport.path.walk import has_one_segment, walk_path
 from mivol.transport.traversal.random_numbers import SpreadSampler
+from mivol.transport.traversal.rays import give_each_lane_a_ray
 
 DEPTHS = (2, 3, 6, -1)
 """Compared depths; the last depth, without a limit, is the reference."""
@@ -178,7 +179,7 @@ def _render_depth_preview(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurve
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0)
     time = mi.Float(sensor.shutter_open())
     ray, weight = sensor.sample_ray_differential(time, mi.Float(0), mi.Point2f(place), aperture)
-    score, _ = walk_path(estimators, sampler, ray, Primal(dr.zeros(mi.Spectrum, n)))
+    score, _ = walk_path(estimators, sampler, give_each_lane_a_ray(ray, n), Primal(dr.zeros(mi.Spectrum, n)))
     seen = np.array(score.L * weight, np.float64).reshape(-1, n).mean(axis=0)
     return seen.reshape(DEPTH_BATCHES, cells, DEPTH_SAMPLES).mean(axis=2)
 
@@ -556,4 +557,6 @@ def _camera_ray(sensor: mi.Sensor, place: mi.Point2f) -> tuple[mi.RayDifferentia
         place = (place * mi.ScalarVector2f(film.size()) - mi.ScalarVector2f(film.crop_offset())) / mi.ScalarVector2f(
             film.crop_size()
         )
-    return sensor.sample_ray_differential(mi.Float(sensor.shutter_open()), mi.Float(0.5), mi.Point2f(place), mi.Point2f(0.5))
+    time, middle = mi.Float(sensor.shutter_open()), mi.Point2f(0.5)
+    ray, weight = sensor.sample_ray_differential(time, mi.Float(0.5), mi.Point2f(place), middle)
+    return give_each_lane_a_ray(ray, dr.width(place)), weight

@@ -28,8 +28,16 @@ from mivol.transport.path.derivatives import prepare_derivatives, replay_branche
 from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.film import CameraRays, LightOfOwnRays, RenderSamples, adjoint_rays, count_passes, render_on_film
 from mivol.transport.path.successive import paths_per_lane, walk_branching, walk_successively
-from mivol.transport.path.walk import has_one_segment, walk_path
+from mivol.transport.path.walk import (
+    has_one_segment,
+    leave_camera,
+    leave_camera_from_memory,
+    walk_from_camera,
+    walk_light,
+    walk_path,
+)
 from mivol.transport.traversal.box import with_placements
+from mivol.transport.traversal.random_numbers import SpreadSampler
 
 
 @dataclass
@@ -231,6 +239,8 @@ def _render_primal(estimators: Estimators, rays: CameraRays, plan: Plan, aovs: l
     count = paths_per_lane(plan.successive_paths, dr.width(rays.ray))
     if count > 1:
         L, alpha = walk_successively(estimators, rays.sampler, rays.ray, count)
+    elif estimators.segment.ends_in_media and isinstance(rays.sampler, SpreadSampler):
+        L, alpha, _ = walk_light(estimators, leave_camera_from_memory(estimators, rays.sampler, rays.ray), stops=False)
     else:
         L, alpha = _walk_paths(estimators, rays)
     return L, alpha, integrate_aovs(estimators.media, rays.ray, aovs)
@@ -265,12 +275,11 @@ def _replay(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum, branches:
 
 
 def _replay_whole(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -> None:
-    again, L = rays.sampler.clone(), None
+    start, L = leave_camera(estimators, rays.sampler, rays.ray), None
     if not has_one_segment(estimators):
-        known = Primal(zero_radiance(rays.ray))
-        L = walk_path(estimators.replayed(), rays.sampler, rays.ray, known)[0].L
+        L = walk_from_camera(estimators.replayed(), start.clone(), Primal(zero_radiance(rays.ray)))[0].L
         dr.eval(L)
-    walk_path(estimators, again, rays.ray, Replay(L, dL))
+    walk_from_camera(estimators, start, Replay(L, dL))
 
 
 def zero_radiance(ray: mi.Ray3f) -> mi.Spectrum:

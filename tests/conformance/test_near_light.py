@@ -9,10 +9,10 @@ import mitsuba as mi
 import numpy as np
 import oracle_scattering as twins
 import pytest
-from false_alarms import assert_precise, assert_same_mean, fresh
+from false_alarms import assert_precise, assert_same_mean, difference, fresh
 from numpy.typing import NDArray
 from refusals import assert_refused
-from scattering_gradients import DENSITIES, GRID, assert_gradient, gradients, weights
+from scattering_gradients import DENSITIES, GRID, assert_gradient, backward, gradients, weights
 from scattering_scenes import (
     PLACE,
     aimed,
@@ -40,6 +40,7 @@ from mivol.transport.estimators.segment import PathSegment
 from mivol.transport.estimators.single_scattering import near_light
 from mivol.transport.estimators.single_scattering.near_light import NearLighting
 from mivol.transport.path.estimators import Settings
+from mivol.validate.statistics import Moments
 from scenes import ball_of, box_of, medium
 
 SEGMENTS = {"near_light": "segments"}
@@ -142,6 +143,29 @@ def test_two_scatterings_in_an_endless_fog():
     found = replace(found, mean=found.mean[..., :1], m2=found.m2[..., :1])
     assert_same_mean(found, truth, rounding=1e-5 * truth, what="the first two orders")
     assert_precise(found, 0.01 * truth, what="the first two orders")
+
+
+@pytest.mark.statistical
+def test_the_derivative_by_an_endless_fog() -> None:
+    """A scene without shapes has no size, and a radiance meter one ray for all lanes, which starts 9e-5 ahead of the sensor."""
+    h, away, sigma, step = 0.7, 1.2, 0.5, 1e-3
+    truth = (sum(_orders(h, away, sigma + step)) - sum(_orders(h, away, sigma - step))) / (2 * step)
+    scene, integrator = _lamp_in_fog(h, away, sigma), mi.load_dict(mivol(max_depth=3))
+    even = np.full((1, 1, 3), 1 / 3)
+    values = [backward(scene, "fog.sigma_t.value.value", even, 1 << 14, fresh(s), integrator) for s in range(16)]
+    found = Moments.from_values(np.reshape(values, (16, 1)))
+    assert_same_mean(found, truth, rounding=1e-4 * truth, what="derivative")
+    assert_precise(found, 0.02 * truth, what="derivative")
+
+
+@pytest.mark.statistical
+def test_a_radiance_meter_in_view_of_lit_fog() -> None:
+    """The preview of near light gives each lane the only ray of the meter."""
+    sensor = scenes.pencil(np.array([-3.0, 0.1, 0.2]), np.array([1.0, 0, 0]))
+    scene = mi.load_dict({"type": "scene", "fog": fog(1.0, 0.8)[0], "lamp": point([0.2, 0.7, 1.8], 3.0)[0], "sensor": sensor})
+    found, truth = moments(scene, mivol(max_depth=4), 1 << 10), moments(scene, volpath(max_depth=4), 1 << 12)
+    assert_same_mean(found, truth, rounding=1e-4 * truth.mean, what="radiance")
+    assert_precise(difference(found, truth), 0.1 * truth.mean, what="radiance")
 
 
 # -- Any number of scatterings, against volpath ----------------------------------------------------------------------------

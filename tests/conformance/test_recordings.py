@@ -351,14 +351,14 @@ def test_a_replay_launches_few_kernels() -> None:
     for _ in range(3):
         pair.images(1), pair.gradient(pair.recorded, key, 1)
     image = lambda: dr.eval(mi.render(pair.scene, integrator=pair.recorded, seed=2, spp=2))  # noqa: E731
-    assert count_launches(image) <= 10
-    assert count_launches(lambda: pair.gradient(pair.recorded, key, 2)) <= 69
+    assert count_launches(image) <= 14
+    assert count_launches(lambda: pair.gradient(pair.recorded, key, 2)) <= 83
 
     def step() -> None:
         pair.scale(key, 0.99), pair.gradient(pair.recorded, key, 2)
 
     # A changed grid is read again: its update, one kernel for the extremes of its blocks, and their table.
-    assert count_launches(step) <= 81
+    assert count_launches(step) <= 95
 
 
 def test_a_changed_grid_is_read_without_tracing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -779,7 +779,7 @@ def test_collections_are_put_off_for_a_while() -> None:
 @pytest.mark.slow_for("forward", "reverse")
 @pytest.mark.parametrize("way", ["picture", "reverse", "forward"])
 def test_paths_are_recorded_without_them(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
-    seen, name = [], {"picture": "walk_path", "reverse": "replay_branches", "forward": "_render_tangent"}[way]
+    seen, name = [], {"picture": "_render_primal", "reverse": "replay_branches", "forward": "_render_tangent"}[way]
     walk = getattr(render_tasks, name)
     monkeypatch.setattr(render_tasks, name, lambda *a, **k: seen.append(gc.isenabled()) or walk(*a, **k))
     scene = close_up({"smoke": smoke(rough_grid(1), 0.5)[0], "sky": scenes.sky(1.0)}, res=2)

@@ -3,6 +3,7 @@ pay."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -21,10 +22,11 @@ from mivol.scene.plan import build_estimators, make_plan
 from mivol.scene.survey import BranchNoise, survey_scene
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.path import successive
-from mivol.transport.path.estimators import Settings
+from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.film import RenderSamples, film_passes
 from mivol.transport.path.successive import paths_per_lane, walk_branching, walk_successively
-from mivol.transport.path.walk import walk_path
+from mivol.transport.path.walk import leave_camera_from_memory, walk_light, walk_path
+from mivol.transport.traversal.random_numbers import SpreadSampler
 from scenes import ball_of, box_of, camera, grid_volume, medium, sky
 
 ENDLESS = mivol(max_depth=-1)
@@ -144,16 +146,42 @@ def test_branches_in_a_white_furnace_end_with_the_light_of_the_sky() -> None:
         np.testing.assert_allclose(found, 1.0, rtol=1e-5)
 
 
+def whole(estimators: Estimators, sampler: SpreadSampler, ray: mi.Ray3f, _: int) -> tuple:
+    """Radiance and alpha of paths that one kernel walks from the camera to their ends."""
+    score, alpha = walk_path(estimators, sampler, ray, Primal(dr.zeros(mi.Spectrum, dr.width(ray))))
+    return score.L, alpha
+
+
 def test_branches_keep_the_alpha() -> None:
     """A ray of one path and a ray of branches have the same first flight."""
-
-    def whole(estimators: object, sampler: object, ray: mi.Ray3f, _: int) -> tuple:
-        score, alpha = walk_path(estimators, sampler, ray, Primal(dr.zeros(mi.Spectrum, dr.width(ray))))
-        return score.L, alpha
-
     alone = radiance(peaked(), 1, whole)[3]
     assert 0 < alone.mean() < 1
     assert np.array_equal(radiance(peaked(), 2, walk_branching)[3], alone)
+
+
+def test_the_shared_kernel_finds_the_light_of_whole_paths() -> None:
+    """Light and alpha of an image that starts from memory equal those of a walk in one kernel, to the last bit."""
+
+    def shared(estimators: Estimators, sampler: SpreadSampler, ray: mi.Ray3f, _: int) -> tuple:
+        return walk_light(estimators, leave_camera_from_memory(estimators, sampler, ray), stops=False)[:2]
+
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.3]).scale(3)}
+    matter = smoke(rough_grid(7, 6.0), 0.9)[0]
+    for scene in (peaked(), close_up({"matter": matter, "floor": floor, "sky": sky(1.0)}, res=8)):
+        assert np.array_equal(radiance(scene, 1, shared), radiance(scene, 1, whole))
+
+
+def test_images_and_gradients_share_their_kernels() -> None:
+    """One kernel finds the first flights of an image, of stems and of the baseline; one walks image, stems and branches."""
+    scene = close_up({"matter": smoke(rough_grid(7, 6.0), 0.9)[0], "sky": sky(1.0)}, res=8)
+    params = mi.traverse(scene)
+    dr.enable_grad(params["matter.interior_medium.sigma_t.data"])
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        dr.backward(dr.mean(mi.render(scene, params, integrator=mi.load_dict(mivol(max_depth=6)), spp=1), axis=None))
+        large = [k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and k["operation_count"] > 500]
+    replay_and_baseline, flights_and_light = [1, 1], [3, 3]
+    assert sorted(Counter(large).values()) == replay_and_baseline + flights_and_light
 
 
 def count_of(stem: float, branch: float, share: float, events: float, samples: int = 1 << 20) -> int:

@@ -21,11 +21,10 @@ from mivol.scene.plan import build_estimators, make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.flights.baseline import BLOCKS, BaselineSums
 from mivol.transport.estimators.scores import Replay
-from mivol.transport.estimators.segment import Collision
 from mivol.transport.path import derivatives
 from mivol.transport.path.derivatives import count_baseline_paths, count_branches, prepare_derivatives
 from mivol.transport.path.estimators import Estimators, Settings
-from mivol.transport.path.walk import Path, walk_part
+from mivol.transport.path.walk import Path, PathStart, walk_part
 from scenes import ball_of, box_of, camera, grid_volume, medium, skip_recorded_grids_on_a_gpu, sky
 
 MEDIUM = "smoke.interior_medium."
@@ -90,13 +89,11 @@ def replays(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, np.ndarray, np.n
     # A recorded loop would hide the values.
     monkeypatch.setattr(derivatives, "replay_in_one_kernel", lambda width, walk: [walk(mi.Bool(k == 0)) for k in range(2)])
 
-    def watched_walk(estimators: Estimators, path: Path, collision: Collision, stops: mi.Bool | None = None) -> Path:
-        before = path.score
-        path = walk_part(estimators, path, collision, stops)
-        if isinstance(before, Replay):
-            dr.eval(path.score.L)
-            name = "stems" if dr.all(stops) else "branches"
-            seen.append((name, np.array(before.L), np.array(path.score.L), np.array(before.dL)))
+    def watched_walk(estimators: Estimators, start: PathStart, score: Replay, stops: mi.Bool, probes: tuple[str, ...]) -> Path:
+        path = walk_part(estimators, start, score, stops, probes)
+        dr.eval(path.score.L)
+        name = "stems" if dr.all(stops) else "branches"
+        seen.append((name, np.array(score.L), np.array(path.score.L), np.array(score.dL)))
         return path
 
     monkeypatch.setattr(derivatives, "walk_part", watched_walk)
@@ -134,9 +131,9 @@ def test_branches_of_a_stem_differ(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(derivatives._Branching, "of", lambda *args: made.append(real(*args)) or made[0])
     monkeypatch.setattr(derivatives, "BALANCE", 1e3)
     gradient_of_mean_image(smoky(), KEYS["density"], 64, fresh(3))
-    branches, share = made[0].gather(dr.arange(mi.UInt32, dr.width(made[0].collided))), made[0].share
-    on = np.array(branches.collision.on)
-    stem, sampler = np.array(branches.stem)[on], branches.sampler
+    (stem, branches), share = made[0].gather(dr.arange(mi.UInt32, dr.width(made[0].collided))), made[0].share
+    on = np.array(branches.active)
+    stem, sampler = np.array(stem)[on], branches.sampler
     numbers = np.array([sampler.state, sampler.bits])[:, on]
     assert share[0] == 0.5
     assert np.array_equal(np.unique(stem, return_counts=True)[1], np.full(len(stem) // 2, 2))

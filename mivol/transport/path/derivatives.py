@@ -14,7 +14,7 @@ k = sqrt(B a / (A b)), and b is proportional to the share of stems with a collis
 Only the device knows the number of branches, so that derivatives can be recorded and replayed. Branches have as many lanes as
 stems, of which the last are off.
 
-Bias: none. Memory: about 40 numbers a stem.
+Bias: none. Memory: about 80 numbers a stem.
 
 References: Arvo & Kirk 1990 (splitting); Vicini et al. 2021 (path replay).
 """
@@ -22,19 +22,18 @@ References: Arvo & Kirk 1990 (splitting); Vicini et al. 2021 (path replay).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.estimators.flights.baseline import Baseline, BaselineSums
-from mivol.transport.estimators.scores import Factor, Primal, Replay, Rest
+from mivol.transport.estimators.scores import Factor, Replay, Rest
 from mivol.transport.estimators.segment import SegmentTransmittance
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays
-from mivol.transport.path.walk import FirstCollision, Path, start_branch, start_stem, walk_part, walk_path, walk_stem
+from mivol.transport.path.walk import PathStart, leave_camera_from_memory, walk_from_camera, walk_light, walk_part
 from mivol.transport.traversal.random_numbers import SpreadSampler
-from mivol.transport.traversal.rays import clip_camera_ray
 
 __all__ = ["count_branches", "prepare_derivatives", "replay_branches"]
 
@@ -85,38 +84,31 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
         rays: camera rays, with a sampler of spread numbers.
         dL: d loss / d radiance of each ray.
     """
-    n, sampler = dr.width(rays.ray), rays.sampler
-    first, replayed_sampler, replayed = sampler.clone(), sampler.clone(), estimators.replayed()
+    first, replayed = rays.sampler.clone(), estimators.replayed()
+    start = leave_camera_from_memory(estimators, rays.sampler, rays.ray)
+    n = dr.width(start.ray)
 
     # -- The radiance of stems and branches ------------------------------------------------------------------------------
-    stems, collision, _ = walk_stem(replayed, sampler, rays.ray, Primal(dr.zeros(mi.Spectrum, n)))
+    stem_light, _, stems = walk_light(replayed, start.clone(), stops=True)
     baseline = estimators.segment.baseline
-    light, lane = _PackedLight.of(stems.L), dr.arange(mi.UInt32, n)
+    light, lane = _PackedLight.of(stem_light), dr.arange(mi.UInt32, n)
     dr.schedule(dL)
-    branching = _Branching.of(collision, first, USUAL_NOISE if baseline is None else baseline.noise)
-    branches = branching.gather(lane)
-    path = walk_part(
-        replayed, branches.start(replayed, Primal(dr.zeros(mi.Spectrum, n))), branches.collision.event(replayed.media)
-    )
-    light.add(path.score.L * branching.share, branches.stem, branches.collision.on)
-    # One kernel walks the branches, adds their light to the stems, and counts them by length.
+    branching = _Branching.of(PathStart.at_stop(stems, first), USUAL_NOISE if baseline is None else baseline.noise)
+    stem, branches = branching.gather(lane)
+    L, _, path = walk_light(replayed, branches.in_memory(), stops=False)
+    light.add(L * branching.share, stem, branches.active)
     lengths = _Lengths.of(path.depth)
-    dr.eval(path.score.L, lengths)
+    dr.eval(lengths)
 
     # -- Their replays ---------------------------------------------------------------------------------------------------
     order = lengths.sort()
-    branches, L = branching.gather(order), dr.gather(mi.Spectrum, path.score.L, order)
-    dL_branch = dr.gather(mi.Spectrum, dL, branches.stem) * branching.share
-
-    stem_light = light.gather(lane)
+    stem, branches = branching.gather(order)
+    branch_score = Replay(dr.gather(mi.Spectrum, L, order), dr.gather(mi.Spectrum, dL, stem) * branching.share)
+    stem_score = Replay(light.gather(lane), dL)
 
     def replay(is_stem: mi.Bool) -> None:
-        probes = ("first", "later")
-        stem = start_stem(estimators, replayed_sampler.clone(), rays.ray, Replay(stem_light, dL), *probes)
-        branch = branches.start(estimators, Replay(L, dL_branch), *probes)
-        branch.known = None if stem.known is None else stem.known.forget()
-        begun = branches.collision.event(estimators.media)
-        walk_part(estimators, dr.select(is_stem, stem, branch), replace(begun, on=begun.on & ~is_stem), is_stem)
+        begun, score = dr.select(is_stem, (start.clone(), stem_score), (branches.clone(), branch_score))
+        walk_part(estimators, begun, score, is_stem, ("first", "later"))
 
     replay_in_one_kernel(n, replay)
 
@@ -179,64 +171,47 @@ class _Branching:
     """The collisions at the ends of stems, each with as many branches.
 
     Attributes:
-        collision: collisions of the stems.
-        sampler: random numbers of the stems.
+        start: starts of branches, without their random numbers: at the collisions, with the random numbers of the stems.
         collided: the stems with a collision; the other numbers are left over.
         count: number of these stems (an array of one number).
         each: branches of a stem (an array of one number).
     """
 
-    collision: FirstCollision
-    sampler: SpreadSampler
+    start: PathStart
     collided: mi.UInt32
     count: mi.UInt32
     each: mi.UInt32
 
     @classmethod
-    def of(cls, collision: FirstCollision, sampler: SpreadSampler, noise: mi.Float | float) -> _Branching:
+    def of(cls, start: PathStart, noise: mi.Float | float) -> _Branching:
         """List the stems with a collision, and choose the number of branches.
 
         Args:
-            collision, sampler: as in the class.
+            start: as in the class.
             noise: as of :func:`count_branches`.
         """
-        n = dr.width(collision.on)
+        n = dr.width(start.active)
         count, collided = dr.opaque(mi.UInt32, 0), dr.zeros(mi.UInt32, n)
-        place = dr.scatter_inc(count, mi.UInt32(0), collision.on)
-        dr.scatter(collided, dr.arange(mi.UInt32, n), place, collision.on)
-        dr.eval(collision, sampler, collided, count)
-        return cls(collision, sampler, collided, count, count_branches(n, count, noise))
+        place = dr.scatter_inc(count, mi.UInt32(0), start.active)
+        dr.scatter(collided, dr.arange(mi.UInt32, n), place, start.active)
+        dr.eval(start, collided, count)
+        return cls(start, collided, count, count_branches(n, count, noise))
 
     @property
     def share(self) -> mi.Float:
         """Share of each branch in the light of its stem [1]."""
         return dr.rcp(mi.Float(self.each))
 
-    def gather(self, number: mi.UInt32) -> _Branches:
-        """The branches with these numbers: the branches of a stem have consecutive numbers."""
+    def gather(self, number: mi.UInt32) -> tuple[mi.UInt32, PathStart]:
+        """The stems and the starts of the branches with these numbers: the branches of a stem have consecutive numbers.
+
+        There is a lane for each stem, since a recording cannot depend on the number of branches; the last lanes are off.
+        """
         on = number < self.count * self.each
         stem = dr.gather(mi.UInt32, self.collided, number // self.each, on)
-        sampler = self.sampler.gather(stem).branch(number % self.each, self.each)
-        return _Branches(stem, self.collision.gather(stem, on), sampler)
-
-
-@dataclass
-class _Branches:
-    """Branches of paths: a lane for each stem, since a recording cannot depend on their number. The last lanes are off.
-
-    Attributes:
-        stem: index of the stem of each branch.
-        collision: collision at the end of the stem; off in lanes without a branch.
-        sampler: random numbers of each branch.
-    """
-
-    stem: mi.UInt32
-    collision: FirstCollision
-    sampler: SpreadSampler
-
-    def start(self, estimators: Estimators, score: Primal | Replay, *probes: str) -> Path:
-        """Start to walk the branches at their collisions."""
-        return start_branch(estimators, self.sampler.clone(), self.collision, score, *probes)
+        start = self.start.gather(stem, on)
+        start.sampler = start.sampler.branch(number % self.each, self.each)
+        return stem, start
 
 
 @dataclass
@@ -303,13 +278,13 @@ def _estimate_baseline(estimators: Estimators, ray: mi.Ray3f) -> Baseline | None
     rays = mi.Ray3f(ray)
     # Gathers need evaluated arrays: one evaluation of all, in place of a kernel for each.
     dr.eval(rays)
-    chosen = clip_camera_ray(dr.gather(mi.Ray3f, rays, index))
+    chosen = dr.gather(mi.Ray3f, rays, index)
 
     # -- Their light, and the light behind each of their collisions ------------------------------------------------------
     # Numbers of pixels outside of every film.
     lane, one = dr.arange(mi.UInt32, count), mi.UInt32(1)
-    sampler = SpreadSampler.of_pixels(mi.Vector2i(lane, -1), mi.UInt32(BASELINE_SEED), dr.zeros(mi.UInt32, count), one)
-    sums = BaselineSums(media)
+    sampler = SpreadSampler.of_pixels(mi.Vector2i(lane, -1), mi.UInt32(BASELINE_SEED), dr.opaque(mi.UInt32, 0, count), one)
+    sums, start = BaselineSums(media), leave_camera_from_memory(estimators, sampler, chosen)
 
     def turn(number: mi.UInt32, L: mi.Spectrum) -> tuple[mi.UInt32, mi.Spectrum]:
         """Walk the paths: the first time for their light, the second time with it for the light behind collisions. As a loop
@@ -320,10 +295,10 @@ def _estimate_baseline(estimators: Estimators, ray: mi.Ray3f) -> Baseline | None
             if isinstance(factor, SegmentTransmittance):
                 factor.shared.collect(sums, light, is_known)
 
-        rest = walk_path(estimators, sampler.clone(), chosen, Rest(L, collect))[0].L
+        rest = walk_from_camera(estimators, start.clone(), Rest(L, collect))[0].L
         return number + 1, dr.select(is_known, L, -dr.detach(rest))
 
-    start = dr.zeros(mi.UInt32, count), dr.zeros(mi.Spectrum, count)
-    _, L = dr.while_loop(state=start, cond=lambda number, L: number < 2, body=turn, label="baseline")
+    state = dr.zeros(mi.UInt32, count), dr.zeros(mi.Spectrum, count)
+    _, L = dr.while_loop(state=state, cond=lambda number, L: number < 2, body=turn, label="baseline")
     sums.add_path(L)
     return sums.finish()

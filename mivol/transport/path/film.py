@@ -22,6 +22,7 @@ from mivol.errors import MivolError
 from mivol.kernel_recording import is_recording
 from mivol.scene_graph import find_children
 from mivol.transport.traversal.random_numbers import SpreadSampler
+from mivol.transport.traversal.rays import give_each_lane_a_ray
 
 __all__ = ["CameraRays", "LightOfOwnRays", "RenderSamples", "adjoint_rays", "film_passes", "render_on_film"]
 
@@ -193,7 +194,8 @@ def _sample_rays(samples: RenderSamples, time: mi.Float, on_film: mi.Point2f, ap
         index = mi.UInt32(along)
         sensor = dr.gather(mi.SensorPtr, samples.views, dr.minimum(index, count - 1))
         on_film = mi.Point2f(along - mi.Float(index), on_film.y)
-    return sensor.sample_ray_differential(time, wavelength, on_film, aperture)
+    ray, weight = sensor.sample_ray_differential(time, wavelength, on_film, aperture)
+    return give_each_lane_a_ray(ray, dr.width(on_film)), weight
 
 
 def render_on_film(

@@ -18,7 +18,7 @@ References: Novák et al. 2010 (path regeneration); Aila & Laine 2009 (threads t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -30,16 +30,15 @@ from mivol.transport.estimators.segment import KnownFlight
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.walk import (
     Path,
+    PathStart,
     advance_path,
+    begin_path,
     film_alpha,
-    gather_lanes,
     leave_camera,
-    start_branch,
-    start_path,
-    walk_stem,
+    leave_camera_from_memory,
+    walk_light,
 )
 from mivol.transport.traversal.random_numbers import SpreadSampler
-from mivol.transport.traversal.rays import clip_camera_ray
 
 __all__ = ["paths_per_lane", "walk_branching", "walk_successively"]
 
@@ -50,32 +49,6 @@ a GPU holds about 2^18 lanes. The number of threads does not enter, so a seed gi
 
 BRANCHED_PATHS = 16
 """Paths for each lane, of those that may branch."""
-
-
-@dataclass
-class _PathStarts:
-    """Starts of paths at the camera, one for each sample.
-
-    Attributes:
-        ray: camera rays, ended at the sensor's ``far_clip``.
-        medium: media around their origins.
-        sampler: random numbers of each path.
-        known: flights of the camera rays; None if they are drawn with the segment.
-    """
-
-    ray: mi.Ray3f
-    medium: mi.MediumPtr
-    sampler: SpreadSampler
-    known: KnownFlight | None
-
-    def gather(self, index: mi.UInt32, active: mi.Bool) -> tuple[mi.Ray3f, mi.MediumPtr, SpreadSampler, KnownFlight | None]:
-        """Gather ray, medium, sampler and flight of paths by their numbers."""
-        ray = self.ray
-        o, d, maxt, time = (gather_lanes(values, index, active) for values in (ray.o, ray.d, ray.maxt, ray.time))
-        sampler = self.sampler.gather(index, active)
-        ray = mi.Ray3f(o, d, maxt, time, ray.wavelengths)
-        known = None if self.known is None else self.known.at(index, active)
-        return ray, gather_lanes(self.medium, index, active), sampler, known
 
 
 def paths_per_lane(limit: int, paths: int) -> int:
@@ -124,18 +97,13 @@ def walk_successively(
     """
     n = dr.width(ray)
     lanes, paths = -(-n // count), _WorkList(dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, 0))
-    clipped, medium, sampler = clip_camera_ray(ray), estimators.media.medium_at(ray), sampler.clone()
-    known = estimators.segment.find_first_collision(clipped, medium, sampler, dr.full(mi.Bool, True, n))
-    starts = _PathStarts(clipped, medium, sampler, known)
+    starts = leave_camera(estimators, sampler.clone(), ray)
     L, alpha = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Float, n)
     kept = KeptShadow.empty(n) if estimators.tabulates_shadows else None
     dr.eval(starts, L, alpha, kept)
 
     def start(index: mi.UInt32, active: mi.Bool) -> Path:
-        ray, medium, sampler, known = starts.gather(index, active)
-        path = start_path(estimators, ray, Primal(dr.zeros(mi.Spectrum, lanes)), sampler, active)
-        path.known = known
-        return leave_camera(estimators, path, medium)
+        return begin_path(estimators, starts.gather(index, active), Primal(dr.zeros(mi.Spectrum, lanes)))
 
     def advance(path: Path, index: mi.UInt32, on: mi.Bool) -> tuple[Path, mi.UInt32, mi.Bool]:
         path = advance_path(estimators, path)
@@ -174,22 +142,25 @@ def walk_branching(
         The radiance, the alpha (in [0, 1]) and the number of scattering events of each path, by its last branch; 0 events
         without a collision.
 
-    Bias: none. Variance: A + B / count, with the variance A of stems and B of a branch. Memory: 40 numbers a path, 58 with
+    Bias: none. Variance: A + B / count, with the variance A of stems and B of a branch. Memory: 65 numbers a path, 83 with
     tabulated shadows.
     """
     n, first = dr.width(ray), sampler.clone()
-    stems, collision, alpha = walk_stem(estimators, sampler, ray, Primal(dr.zeros(mi.Spectrum, n)))
+    light, alpha, stems = walk_light(estimators, leave_camera_from_memory(estimators, sampler, ray), stops=True)
+    ends = PathStart.at_stop(stems, first)
     collided, found = dr.zeros(mi.UInt32, n), _WorkList(dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, 0))
-    dr.scatter(collided, dr.arange(mi.UInt32, n), *found.take(collision.on))
+    dr.scatter(collided, dr.arange(mi.UInt32, n), *found.take(ends.active))
     L, events = dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n)
     kept = KeptShadow.empty(n) if estimators.tabulates_shadows else None
-    dr.eval(stems.L, alpha, collision, first, found.taken, collided, L, events, kept)
+    dr.eval(ends, found.taken, collided, L, events, kept)
     lanes, each = -(-n // paths_per_lane(BRANCHED_PATHS, n)), dr.opaque(mi.UInt32, count)
     todo = _WorkList(found.taken, dr.opaque(mi.UInt32, 0))
 
     def start(stem: mi.UInt32, branch: mi.UInt32, active: mi.Bool, score: Primal) -> tuple[Path, KnownFlight]:
-        at, numbers = collision.gather(stem, active), first.gather(stem, active).branch(branch, each)
-        return start_branch(estimators, numbers, at, score), KnownFlight(at.t, at.body, active)
+        at = ends.gather(stem, active)
+        at.sampler = at.sampler.branch(branch, each)
+        # A branch does not fly before its first event.
+        return begin_path(estimators, replace(at, flight=None), score), at.flight
 
     def advance(path: Path, begun: KnownFlight, stem: mi.UInt32, branch: mi.UInt32, on: mi.Bool) -> tuple:
         hit = make_collision(estimators.media, path.ray, begun.t, begun.body, path.active & begun.on)
@@ -221,4 +192,4 @@ def walk_branching(
     dr.eval(L, events, kept)
     if kept is not None:
         L += kept.light_at_camera(estimators.media, ray)
-    return stems.L + L * dr.rcp(mi.Float(each)), alpha, events
+    return light + L * dr.rcp(mi.Float(each)), alpha, events

@@ -23,6 +23,7 @@ from typing import Any, TypeVar
 import drjit as dr
 import mitsuba as mi
 
+from mivol.kernel_recording import begin_kernel
 from mivol.transport.estimators.flights.flight_derivatives import Probe, Probes, ProbeTerm, ShadowReservoir, ShadowTerm
 from mivol.transport.estimators.flights.free_flight import make_collision
 from mivol.transport.estimators.lighting.direct_lighting import (
@@ -37,7 +38,6 @@ from mivol.transport.estimators.segment import Collision, KnownFlight, PathSegme
 from mivol.transport.estimators.single_scattering.near_light import AimedDirections
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.extinction import to_components
-from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.event import DirectionSamples, PathEvent, sample_next_direction
 from mivol.transport.path.side_flight import (
@@ -51,19 +51,20 @@ from mivol.transport.traversal.random_numbers import SpreadSampler, draw_pcg32, 
 from mivol.transport.traversal.rays import FineRay, Ray, clip_camera_ray, point_along
 
 __all__ = [
-    "FirstCollision",
     "Path",
+    "PathStart",
     "advance_path",
+    "begin_path",
     "film_alpha",
     "gather_lanes",
     "has_one_segment",
     "leave_camera",
-    "start_branch",
+    "leave_camera_from_memory",
     "start_path",
-    "start_stem",
+    "walk_from_camera",
+    "walk_light",
     "walk_part",
     "walk_path",
-    "walk_stem",
 ]
 
 T = TypeVar("T")
@@ -111,7 +112,8 @@ class Path:
         emission_pdf: ``pdf`` in lanes where ``last`` has sampled the emission of media too, 0 in other lanes [1/sr]; None if
             media emission is never sampled.
         left_medium: lanes in which ``last`` is a point of a medium; None if vertices draw the light of near emitters.
-        known: flights of camera rays, for the first segment of the path; None if they are drawn with the segment.
+        known: flights of camera rays, for the first segment of the path, and the collisions at which stems have stopped; None
+            if all flights are drawn with the segment.
     """
 
     ray: FineRay
@@ -137,56 +139,70 @@ class Path:
 
 
 @dataclass
-class FirstCollision:
-    """The first collisions of camera paths with a medium.
+class PathStart:
+    """The start of a path, at the camera or at its first collision with a medium.
 
     Attributes:
-        ray: ray of the segment that ends at the collision.
-        t: distance of the collision [length].
-        body: index of the medium.
-        beta: throughput up to the collision [1].
-        eta, depth: as of :class:`Path`, at the collision.
-        on: lanes with a collision.
+        ray: camera ray, ended at the sensor's ``far_clip``, or the ray of the segment that ends at the collision.
+        medium: medium around the origin of the ray.
+        beta, eta, depth: as of :class:`Path`.
+        sampler: random numbers of the path, behind those of a known flight.
+        active: lanes to walk.
+        flight: first flights of camera rays, on where they are known, or the collisions.
+        at_collision: lanes that start at the end of their flight.
     """
 
-    ray: FineRay
-    t: mi.Float64
-    body: mi.UInt32
+    ray: Ray
+    medium: mi.MediumPtr
     beta: mi.Spectrum
     eta: mi.Float
     depth: mi.UInt32
-    on: mi.Bool
+    sampler: mi.Sampler | SpreadSampler
+    active: mi.Bool
+    flight: KnownFlight | None
+    at_collision: mi.Bool
 
     @classmethod
-    def none(cls, path: Path) -> FirstCollision:
-        """No collision yet."""
-        n = dr.width(path.ray)
-        t, body, off = dr.zeros(mi.Float64, n), dr.zeros(mi.UInt32, n), dr.full(mi.Bool, False, n)
-        return cls(path.ray, t, body, mi.Spectrum(path.beta), mi.Float(path.eta), mi.UInt32(path.depth), off)
+    def at_stop(cls, path: Path, sampler: SpreadSampler) -> PathStart:
+        """The starts of branches, at the collisions at which paths have stopped."""
+        flight = path.known
+        return cls(path.ray, path.medium, path.beta, path.eta, path.depth, sampler, flight.on, flight, flight.on)
 
-    def keep(self, path: Path, hit: Collision, on: mi.Bool) -> FirstCollision:
-        """The collisions so far, with those of some lanes at the end of the segment of a path."""
-        return FirstCollision(
-            dr.select(on, path.ray, self.ray),
-            dr.select(on, hit.t, self.t),
-            dr.select(on, hit.body, self.body),
-            dr.select(on, path.beta, self.beta),
-            dr.select(on, path.eta, self.eta),
-            dr.select(on, path.depth, self.depth),
-            self.on | on,
+    def in_memory(self) -> PathStart:
+        """The start as arrays in memory, one for each attribute and colour, and no constants: kernels that begin with it then
+        have the same instructions.
+        """
+        lane = dr.arange(mi.UInt32, dr.width(self.ray))
+
+        def write(values: T) -> T:
+            stored = dr.empty(type(values), len(lane))
+            dr.scatter(stored, values, lane)
+            return stored
+
+        ray, sampler = FineRay.from_ray(self.ray), self.sampler
+        flight = self.flight or KnownFlight(mi.Float64(0), mi.UInt32(0), mi.Bool(False))
+        return PathStart(
+            FineRay(*(write(values) for values in (ray.o, ray.d, ray.maxt, ray.time)), ray.wavelengths),
+            *(write(values) for values in (self.medium, self.beta, self.eta, self.depth)),
+            SpreadSampler(*(write(values) for values in (sampler.bits, sampler.state, sampler.lead))),
+            write(self.active),
+            KnownFlight(*(write(values) for values in (flight.t, flight.body, flight.on))),
+            write(self.at_collision),
         )
 
-    def event(self, media: SceneMedia) -> Collision:
-        """The collisions as ends of segments."""
-        return make_collision(media, self.ray, self.t, self.body, self.on)
+    def clone(self) -> PathStart:
+        """The same start for another walk, which draws the same numbers: a walk advances the sampler of its start."""
+        return replace(self, sampler=self.sampler.clone())
 
-    def gather(self, index: mi.UInt32, active: mi.Bool = True) -> FirstCollision:
-        """The collisions of other lanes, on where ``active``."""
+    def gather(self, index: mi.UInt32, active: mi.Bool) -> PathStart:
+        """The starts of the lanes with an index, active where ``active``."""
         ray = self.ray
         o, d, maxt, time = (gather_lanes(values, index, active) for values in (ray.o, ray.d, ray.maxt, ray.time))
-        state = (self.t, self.body, self.beta, self.eta, self.depth, self.on)
-        t, body, beta, eta, depth, on = (gather_lanes(values, index, active) for values in state)
-        return FirstCollision(FineRay(o, d, maxt, time, ray.wavelengths), t, body, beta, eta, depth, on & active)
+        state = (self.medium, self.beta, self.eta, self.depth, self.at_collision)
+        medium, beta, eta, depth, at_collision = (gather_lanes(values, index, active) for values in state)
+        flight = None if self.flight is None else self.flight.at(index, active)
+        fine = FineRay(o, d, maxt, time, ray.wavelengths)
+        return PathStart(fine, medium, beta, eta, depth, self.sampler.gather(index, active), active, flight, at_collision)
 
 
 def start_path(
@@ -218,18 +234,39 @@ def start_path(
     )
 
 
-def leave_camera(estimators: Estimators, path: Path, medium: mi.MediumPtr) -> Path:
-    """Prepare a started path to leave a camera in a medium."""
-    path.is_opaque |= not estimators.settings.hide_emitters and estimators.media.scene.environment() is not None
-    path.medium = medium
-    return _sample_first_emitter(estimators, path)
+def leave_camera(
+    estimators: Estimators, sampler: mi.Sampler | SpreadSampler, ray: mi.Ray3f, active: mi.Bool = True
+) -> PathStart:
+    """Start paths at the camera, and find their first flights where that lowers the noise.
 
-
-def find_first_collision(estimators: Estimators, path: Path) -> Path:
-    """Find the collisions of paths leaving the camera before their first segments, where that lowers the noise."""
+    Args:
+        sampler, ray, active: as in :func:`walk_path`.
+    """
+    ray, medium, flight = clip_camera_ray(ray), estimators.media.medium_at(ray), None
+    active = mi.Bool(active) & (estimators.settings.depth_limit > 0) & dr.full(mi.Bool, True, dr.width(ray))
     if estimators.segment.ends_in_media:
-        path.known = estimators.segment.find_first_collision(path.ray, path.medium, path.sampler, path.active)
-    return path
+        flight = estimators.segment.find_first_collision(ray, medium, sampler, active)
+    beta, eta, depth = mi.Spectrum(1), mi.Float(1), mi.UInt32(0)
+    return PathStart(ray, medium, beta, eta, depth, sampler, active, flight, mi.Bool(False))
+
+
+def leave_camera_from_memory(estimators: Estimators, sampler: SpreadSampler, ray: mi.Ray3f) -> PathStart:
+    """The starts of :func:`leave_camera` in memory, from a kernel that images, derivatives and baselines share."""
+    ray = clip_camera_ray(ray)
+    begin_kernel(ray, sampler)
+    start = leave_camera(estimators, sampler, ray).in_memory()
+    begin_kernel(start)
+    return start
+
+
+def begin_path(estimators: Estimators, start: PathStart, score: Score, *probes: str) -> Path:
+    """A path at its start (see :func:`_start_reservoirs` for ``probes``)."""
+    path = start_path(estimators, start.ray, score, start.sampler, mi.Bool(start.active))
+    path.medium = start.medium
+    path.beta, path.eta, path.depth = path.beta * start.beta, path.eta * start.eta, path.depth + start.depth
+    path.is_opaque |= not estimators.settings.hide_emitters and estimators.media.scene.environment() is not None
+    path.known = start.flight
+    return _sample_first_emitter(estimators, _start_reservoirs(estimators, path, *probes))
 
 
 def has_one_segment(estimators: Estimators) -> bool:
@@ -280,81 +317,60 @@ def walk_path(
     Bias: the bias of the segment estimator. Variance: none at depth 1 beyond the variance inside a pixel; the variance of
     emitter and BSDF samples at surfaces.
     """
-    active = mi.Bool(active) & (estimators.settings.depth_limit > 0)
-    path = start_path(estimators, clip_camera_ray(ray), score, sampler, active)
-    path = leave_camera(estimators, path, estimators.media.medium_at(ray))
+    return walk_from_camera(estimators, leave_camera(estimators, sampler, ray, active), score)
+
+
+def walk_from_camera(estimators: Estimators, start: PathStart, score: Score) -> tuple[Score, mi.Float]:
+    """Walk a path as :func:`walk_path` does, from its start."""
     if has_one_segment(estimators):
-        path, event = _follow_segment(estimators, path)
+        path, event = _follow_segment(estimators, begin_path(estimators, start, score))
         path = _add_emitted_light(estimators, path, event)
         path.is_opaque |= event.at_surface
         return path.score, film_alpha(path)
-    path = find_first_collision(estimators, _start_reservoirs(estimators, path, "first", "later"))
+    path = begin_path(estimators, start, score, "first", "later")
     path = _add_reservoirs(estimators, _walk_to_end(estimators, path))
     return path.score, film_alpha(path)
 
 
-def walk_stem(
-    estimators: Estimators, sampler: SpreadSampler, ray: Ray, score: Primal
-) -> tuple[Primal, FirstCollision, mi.Float]:
-    """Walk a path from the camera, and stop at its first collision with a medium.
-
-    Args:
-        estimators: estimators of the render; their segments end in media.
-        sampler, ray: as in :func:`walk_path`.
-        score: accumulator of radiance.
-
-    Returns:
-        The score, the first collisions, at which branches begin (:func:`start_branch`), and the alpha for the film, in [0, 1].
-    """
-    media, n = estimators.media, dr.width(ray)
-    path = start_stem(estimators, sampler, ray, score)
-
-    def advance(path: Path, first: FirstCollision) -> tuple[Path, FirstCollision]:
-        path, event = _follow_segment(estimators, path)
-        path = _add_emitted_light(estimators, path, event)
-        hit = event.collision
-        first = first.keep(path, hit, path.active & hit.on)
-        if not media.has_surfaces:
-            path.active = dr.full(mi.Bool, False, n)
-            return path, first
-        # Paths that collide stop; the others continue behind the surface.
-        return _scatter(estimators, path, event.omit_collisions(dr.full(mi.Bool, True, n))), first
-
-    first = FirstCollision.none(path)
-    if media.has_surfaces:
-        path, first = dr.while_loop(state=(path, first), cond=lambda path, first: path.active, body=advance, label="stem")
-    else:
-        path, first = advance(path, first)
-    return _add_reservoirs(estimators, path).score, first, dr.select(first.on, 1, film_alpha(path))
-
-
-def walk_part(estimators: Estimators, path: Path, collision: Collision, stops: mi.Bool | None = None) -> Path:
+def walk_part(
+    estimators: Estimators, start: PathStart, score: Score, stops: mi.Bool | None = None, probes: tuple[str, ...] = ()
+) -> Path:
     """Walk stems, branches or both, each in its lanes.
 
     Args:
         estimators: estimators of the render; their segments end in media.
-        path: paths from :func:`start_stem` or :func:`start_branch`.
-        collision: collisions at which branches begin; off in the lanes of stems.
-        stops: lanes of stems, which end at their first collision; None without stems.
+        start: starts of the paths.
+        score: accumulator of radiance or derivatives.
+        stops: lanes of stems, which end at their first collision (``known`` of the path, on there); None without stems.
+        probes: as of :func:`_start_reservoirs`.
 
     Returns:
         The paths at their ends.
     """
-    return _add_reservoirs(estimators, _walk_from_collision(estimators, path, collision, stops))
+    path = begin_path(estimators, start, score, *probes)
+    flight = start.flight
+    at = make_collision(estimators.media, path.ray, flight.t, flight.body, flight.on & start.at_collision)
+    return _add_reservoirs(estimators, _walk_from_collision(estimators, path, at, stops))
 
 
-def start_stem(estimators: Estimators, sampler: SpreadSampler, ray: Ray, score: Primal | Replay, *probes: str) -> Path:
-    """A path that leaves the camera (see :func:`_start_reservoirs` for ``probes``)."""
-    path = start_path(estimators, clip_camera_ray(ray), score, sampler, dr.full(mi.Bool, True, dr.width(ray)))
-    path = find_first_collision(estimators, leave_camera(estimators, path, estimators.media.medium_at(ray)))
-    return _start_reservoirs(estimators, path, *probes)
+def walk_light(estimators: Estimators, start: PathStart, stops: bool) -> tuple[mi.Spectrum, mi.Float, Path]:
+    """Find the light of paths from a kernel that images, stems and branches share, so that it is compiled once.
 
+    Args:
+        estimators: estimators of the render; their segments end in media.
+        start: starts of the paths in memory (:func:`leave_camera_from_memory`, :meth:`PathStart.in_memory`).
+        stops: whether the paths are stems, which end at their first collision.
 
-def start_branch(estimators: Estimators, sampler: SpreadSampler, collision: FirstCollision, score: Score, *probes: str) -> Path:
-    """A path that continues from its first collision (see :func:`_start_reservoirs` for ``probes``)."""
-    path = start_path(estimators, collision.ray, score, sampler, mi.Bool(collision.on))
-    path.beta, path.eta, path.depth = mi.Spectrum(collision.beta), mi.Float(collision.eta), mi.UInt32(collision.depth)
-    return _sample_first_emitter(estimators, _start_reservoirs(estimators, path, *probes))
+    Returns:
+        Radiance, alpha for the film (in [0, 1]), and the paths at their ends, evaluated.
+    """
+    stem = dr.opaque(mi.Bool, stops)
+    begin_kernel(start, stem)
+    path = walk_part(estimators, start, Primal(dr.zeros(mi.Spectrum, dr.width(start.ray))), stem)
+    alpha = dr.select(path.known.on, 1, film_alpha(path))
+    end = path.ray, path.medium, path.beta, path.eta, path.depth, path.known
+    begin_kernel(path.score.L, alpha, end)
+    return path.score.L, alpha, path
 
 
 def advance_path(estimators: Estimators, path: Path, collision: Collision | None = None, stops: mi.Bool | None = None) -> Path:
@@ -371,12 +387,17 @@ def advance_path(estimators: Estimators, path: Path, collision: Collision | None
         path.active = active & ~collision.on
     path, event = _follow_segment(estimators, path)
     path = _add_emitted_light(estimators, path, event)
-    path.active = active
+    path.active, hit, stopped = active, event.collision, None
     if stops is not None:
-        event = event.omit_collisions(stops)
+        stopped, ray, beta = stops & hit.on, path.ray, mi.Spectrum(path.beta)
+        event = event.omit_collisions(stopped)
     if collision is not None:
         event = event.begin_at(replace(collision, on=active & collision.on))
-    return _scatter(estimators, path, event)
+    path = _scatter(estimators, path, event)
+    if stopped is not None:
+        path.ray, path.beta = dr.select(stopped, ray, path.ray), dr.select(stopped, beta, path.beta)
+        path.known = dr.select(stopped, KnownFlight(hit.t, hit.body, stopped), path.known)
+    return path
 
 
 def _walk_to_end(estimators: Estimators, path: Path) -> Path:

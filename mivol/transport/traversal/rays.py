@@ -14,7 +14,16 @@ from typing import Union
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["FineRay", "Ray", "point_along", "to_mitsuba_ray", "clip_camera_ray", "hit_distance", "spawn_ray"]
+__all__ = [
+    "FineRay",
+    "Ray",
+    "clip_camera_ray",
+    "give_each_lane_a_ray",
+    "hit_distance",
+    "point_along",
+    "spawn_ray",
+    "to_mitsuba_ray",
+]
 
 
 @dataclass
@@ -86,6 +95,12 @@ def spawn_ray(si: mi.SurfaceInteraction3f, d: mi.Vector3f, size: mi.Float) -> mi
     step = (dr.minimum(0.25 * size, 1) + dr.max(dr.abs(si.p))) * mi.math.RayEpsilon
     ray = si.spawn_ray(d)
     ray.o = si.p + si.n * dr.mulsign(step, dr.dot(si.n, d))
+    return ray
+
+
+def give_each_lane_a_ray(ray: mi.RayDifferential3f, lanes: int) -> mi.RayDifferential3f:
+    """The rays of a sensor, one for each lane: a radiance meter sends the same ray everywhere, and returns it once."""
+    ray.o = ray.o + dr.zeros(mi.Point3f, lanes)
     return ray
 
 

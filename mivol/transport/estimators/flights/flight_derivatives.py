@@ -487,7 +487,9 @@ def _probe_extinction(media: SceneMedia, body: Body) -> mi.Float:
     """The extinction kappa [1/length]: an optical depth of ``PROBE_TAU`` across the medium; 0 if collisions suffice."""
     if body.is_thick:
         return mi.Float(0)
-    return PROBE_TAU / (media.size if body.edge is None else body.edge)
+    size = media.size if body.edge is None else body.edge
+    # Without any shape nothing ends a flight but a collision, and collisions suffice.
+    return dr.select(size > 0, PROBE_TAU / size, 0)
 
 
 def _emits_at_points(body: Body) -> bool:
