@@ -9,6 +9,7 @@ adapted.
 Axis and tilt. A volume adapts to a wrong tilt almost wholly where the detector cuts the object off, so the residual of its own
 views says little. Every fourth view is therefore predicted by a volume of the others, begun anew. The derivatives are
 differences of such predictions, so they include the adaption of the volume. Each predicted view pulls at the axis and the tilt.
+For the axis alone, the last round predicts each view once: a quarter of the views is off by what its volume has wrong.
 The variance has two parts: the scatter of these pulls (White 1980), and the noise of the volume, which pulls at all predicted
 views at once and is found by ``REPEATS`` volumes of views with more noise.
 
@@ -40,6 +41,7 @@ from mivol.optim.projections.linear_problems import LeastSquares, last_state
 from mivol.tomography.filtered import check_directions, feldkamp, filtered_backprojection
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector
+from mivol.tomography.rotation_axis import SAMPLING_ERROR
 
 UNKNOWNS = ("shift", "axis", "tilt")
 """Names of unknowns: shift and turn of each view; the axis along the columns; its tilts along the light and across it."""
@@ -309,39 +311,65 @@ def _move_axis(
 ) -> tuple[_State, np.ndarray, np.ndarray]:
     """The state after a step of axis and tilt on every fourth view, predicted by the others.
 
-    ``slopes`` are those of an earlier round, or None: find them. Returned after the state: the slopes
-    (judging views, rows, cols, common), and the standard deviations (3,), 0 for what is known.
-    """
-    judges = np.arange(FOLD // 2, len(y), FOLD)
+    The last step of the axis alone is of all views. With a tilt, all views gave deviations too small: -0.037 +- 0.009 degrees.
 
-    def predict(common: np.ndarray, iterations: int, noise: np.ndarray | float = 0.0) -> np.ndarray:
+    ``slopes`` of the first set of predicted views are those of an earlier round, or None: find them. Returned after the state:
+    these slopes (views, rows, cols, common), and the standard deviations (3,), 0 for what is known.
+    """
+
+    def predict(judges: np.ndarray, common: np.ndarray, iterations: int, noise: np.ndarray | float = 0.0) -> np.ndarray:
         at = replace(state, common=common)
         return _predict(at.beam(beam), grid, y + noise, mask, judges, None, iterations)[1][judges]
 
-    if slopes is None:
+    def find_slopes(judges: np.ndarray) -> np.ndarray:
         moved = [COMMON_STEPS * (np.arange(3) == k) for k in common]
-        ends = [(predict(state.common + h, ITERATIONS), predict(state.common - h, ITERATIONS)) for h in moved]
-        slopes = np.stack([(up - down) / (2 * h.sum()) for (up, down), h in zip(ends, moved, strict=True)], -1)
-    predicted, seen = predict(state.common, SETTLED), mask[judges]
-    residual = y[judges] - predicted
-    normal = np.einsum("vrci,vrc,vrcj->vij", slopes, seen, slopes)
-    pull = np.einsum("vrci,vrc,vrc->vi", slopes, seen, residual)
-    inverse = np.linalg.pinv(normal.sum(0), rcond=1e-9)
-    step = inverse @ pull.sum(0)
-    rest = pull - normal @ step
-    covariance = inverse @ (rest.T @ rest) @ inverse
+        ends = [[predict(judges, state.common + sign * h, ITERATIONS) for sign in (1, -1)] for h in moved]
+        return np.stack([(up - down) / (2 * h.sum()) for (up, down), h in zip(ends, moved, strict=True)], -1)
+
+    judges = np.arange(FOLD // 2, len(y), FOLD)
+    slopes = find_slopes(judges) if slopes is None else slopes
+    predicted, seen = predict(judges, state.common, SETTLED), mask[judges]
+    normal, pull = _pull_views(slopes, seen, y[judges] - predicted)
+    inverse = _invert(normal)
+    step, by_volume = inverse @ pull.sum(0), np.zeros((REPEATS, len(common)))
+    first_step = step
     if is_last:
-        rng, variance = np.random.default_rng(0), float((seen * residual**2).sum() / seen.sum() / _smooth_variance(seen.shape))
-        for _ in range(REPEATS):
+        rng, variance = np.random.default_rng(0), _noise_variance(y[judges] - predicted, seen)
+        for k in range(REPEATS):
             noise = math.sqrt(variance) * _smooth(rng.standard_normal(y.shape))
-            change = predict(state.common, SETTLED, noise) - predicted
-            by_volume = inverse @ np.einsum("vrci,vrc,vrc->i", slopes, seen, change)
-            covariance += np.outer(by_volume, by_volume) / REPEATS
+            change = predict(judges, state.common, SETTLED, noise) - predicted
+            by_volume[k] = inverse @ _pull_views(slopes, seen, change)[1].sum(0)
+        for first in set(range(FOLD)) - {FOLD // 2} if common == [0] else ():
+            judges = np.arange(first, len(y), FOLD)
+            residual = y[judges] - predict(judges, state.common, SETTLED)
+            more = _pull_views(find_slopes(judges), mask[judges], residual)
+            normal, pull = (np.concatenate(both) for both in zip((normal, pull), more, strict=True))
+        inverse = _invert(normal)
+        step = inverse @ pull.sum(0)
+    rest = pull - normal @ step
+    covariance = inverse @ (rest.T @ rest) @ inverse + by_volume.T @ by_volume / REPEATS
     moved_by, sigma = np.zeros(3), np.zeros(3)
     moved_by[common] = np.clip(step, -LARGEST_COMMON[common], LARGEST_COMMON[common])
-    # The last step bounds what further rounds would add.
-    sigma[common] = np.hypot(np.sqrt(np.diag(covariance)), step)
+    # The views of all rounds have found their least residual if they ask for no further step.
+    sigma[common] = np.hypot(np.sqrt(np.diag(covariance)), first_step)
+    if common[0] == 0:
+        sigma[0] = math.hypot(sigma[0], SAMPLING_ERROR)
     return replace(state, common=state.common + moved_by), slopes, sigma
+
+
+def _pull_views(slopes: np.ndarray, mask: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations (views, unknowns, unknowns) and pulls (views, unknowns) of each view."""
+    return np.einsum("vrci,vrc,vrcj->vij", slopes, mask, slopes), np.einsum("vrci,vrc,vrc->vi", slopes, mask, residual)
+
+
+def _invert(normal: np.ndarray) -> np.ndarray:
+    """Inverse of the sum of the views' normal equations."""
+    return np.linalg.pinv(normal.sum(0), rcond=1e-9)
+
+
+def _noise_variance(residual: np.ndarray, mask: np.ndarray) -> float:
+    """Variance of readings before smoothing, by the residual of smooth predicted views (views, rows, cols)."""
+    return float((mask * residual**2).sum() / mask.sum() / _smooth_variance(residual.shape))
 
 
 def _fix_gauge(moves: np.ndarray, angles: np.ndarray) -> np.ndarray:
