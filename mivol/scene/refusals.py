@@ -145,7 +145,11 @@ def check_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> No
     reasons = [
         (bool(aovs), f"aovs asks for {', '.join(aovs)}", "leave aovs out"),
         (settings.deterministic, "deterministic is set", "leave it out, for transmittance is estimated"),
-        (bool(rgb), f"a medium scatters or emits, and the bounded field of {', '.join(rgb)} is rgb", "make it grey (a plugin's channel_count(): 1)"),
+        (
+            bool(rgb),
+            f"a medium scatters or emits, and the bounded field of {', '.join(rgb)} is rgb",
+            "make it grey (a plugin's channel_count(): 1)",
+        ),
         (bool(moved), f"the derivative of {', '.join(moved)} was requested", "use finite differences"),
     ]
     kind = f"is a {medium.bounded}, which is bounded (a majorant is known, and no optical depth of a ray)"
