@@ -95,6 +95,7 @@ def convert_file(source: Path, target: Path, kind: str | None, box: Sequence[flo
         raise refusal("convert_file", f"kind={kind!r}", f"one of {', '.join(KINDS)}", "choose one of those")
     check_file(source)
     has_gaussians = is_gaussian_file(source)
+    select_by_suffix(source, {**CLOUD_READERS, **GAUSSIAN_READERS})
     select_by_suffix(target, {**CLOUD_WRITERS, **GAUSSIAN_WRITERS})
     kind = kind or ("gaussians" if has_gaussians and target.suffix.lower() in GAUSSIAN_WRITERS else "points")
     contents = read_gaussians(source) if has_gaussians else read_points(source)

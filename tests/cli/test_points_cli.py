@@ -13,7 +13,7 @@ from mivol.cli import main
 from mivol.experiments.render import frame_points
 from mivol.files.mesh import read_ply
 from mivol.points.cloud import PointCloud, read_points, write_points
-from mivol.points.gaussian_files import read_gaussians, write_gaussians
+from mivol.points.gaussian_files import GAUSSIAN_READERS, read_gaussians, write_gaussians
 from mivol.points.gaussians import CONSTANT_HARMONIC, Gaussians
 
 
@@ -58,6 +58,9 @@ def test_convert_refuses_a_format_that_it_does_not_write(tmp_path: Path, capsys:
     assert "the suffix '.drc', expected one of .ply, .npy" in capsys.readouterr().err
     assert main(["convert", str(tmp_path / "none.ply"), str(tmp_path / "b.ply")]) == 1
     assert "nothing there" in capsys.readouterr().err
+    (tmp_path / "a.jpg").write_bytes(b"a photograph")
+    assert main(["convert", str(tmp_path / "a.jpg"), str(tmp_path / "b.html")]) == 1
+    assert set(GAUSSIAN_READERS) <= set(capsys.readouterr().err.replace(",", " ").replace(";", " ").split())
 
 
 def test_convert_says_which_flags_are_of_fields(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
