@@ -40,6 +40,7 @@ from mivol.optim.photographs.sampled_problem import SampledProblem
 from mivol.optim.strategy import suggest_name
 from mivol.photos import Camera, Photo, Photos, rectify
 from mivol.photos.camera_path import HomeView
+from mivol.photos.exposures import measure_exposures
 from mivol.photos.photo_file import CONVERSIONS
 from mivol.photos.region import FEWEST_POINTS, count_levels, median_distance, nested_boxes, points_in_box
 from mivol.report.pixel_scale import depth_pixels, normal_pixels, normals_from_depth
@@ -195,6 +196,11 @@ GAINS = PlanLine(
     reason="for cameras with automatic exposure; dropped after the first stage if the photographs agree",
 )
 
+KEPT_GAINS = PlanLine(
+    choice="gains of each photograph",
+    reason="common points differ in brightness from what the nearest photographs predict",
+)
+
 SMALLEST = 16
 """Shortest edge of a shrunk photograph [pixel]."""
 
@@ -252,7 +258,7 @@ def adapt_plan(plan: RadiancePlan, photos: Photos) -> RadiancePlan:
     A plan for cubes keeps the number of nodes in a box of other proportions; the voxels stay at least as large as the plan's
     voxels and as a pixel. Photographs shrink to the plan's number of pixels per voxel at the middle of the box. Stages take no
     more steps than their pixels justify. Few photographs get a lower degree. The nested boxes end at the first
-    box with the reconstructed points and the cameras.
+    box with the reconstructed points and the cameras. Gains stay to the end if common points show that exposures differ.
     """
     cameras, box = [view.camera for view in photos.views], photos.box
     pixel = np.median([np.linalg.norm(camera.origin - box.mean(axis=0)) / camera.K[0, 0] for camera in cameras])
@@ -272,7 +278,7 @@ def adapt_plan(plan: RadiancePlan, photos: Photos) -> RadiancePlan:
 
     if len(photos.views) < FEW_PHOTOGRAPHS:
         plan = adapt_to_few(plan)
-    plan = reduce_levels(plan, photos)
+    plan = keep_gains(reduce_levels(plan, photos), photos)
     stages = [suited_stage(stage) for stage in plan.stages]
     epochs = max(plan.epochs, FEWEST_STEPS / steps_an_epoch(stages[-1]))
     stages = [replace(stage, steps=max(1, int(min(stage.steps, epochs * steps_an_epoch(stage))))) for stage in stages]
@@ -284,6 +290,15 @@ def adapt_to_few(plan: RadiancePlan) -> RadiancePlan:
     degree = plan.degree if plan.few_degree is None else plan.few_degree
     matte = plan.matte if plan.few_matte is None else plan.few_matte
     return replace(plan, tv_every=1, degree=degree, matte=matte)
+
+
+def keep_gains(plan: RadiancePlan, photos: Photos) -> RadiancePlan:
+    """Return the plan, without the removal of gains if common points show that exposures differ.
+
+    The gains after a short first stage tell too little: they are still small, whether exposures differ or not.
+    """
+    exposures = measure_exposures(photos.views) if plan.exposure else None
+    return plan if exposures is None or not exposures.differ else replace(plan, agree=0.0)
 
 
 def reduce_levels(plan: RadiancePlan, photos: Photos) -> RadiancePlan:
@@ -334,7 +349,7 @@ def explain_plan(plan: RadiancePlan, photos: Photos, batches: RayBatches) -> lis
         explain_sizes(plan, (width, height)),
         explain_degree(plan, len(photos.views)),
         explain_background(plan, photos),
-        *[GAINS][: plan.exposure],
+        *explain_gains(plan),
         *[MOTIONS][: plan.poses],
         PlanLine(choice=f"rays end at a transmittance of {plan.stop:g}", reason="largest neglected share of the light"),
         PlanLine(choice=check_memory(plan, box, batches), reason="estimated before the allocation"),
@@ -371,12 +386,18 @@ def explain_free_space(plan: RadiancePlan, photos: Photos) -> list[PlanLine]:
     return [describe_free_space(cameras, median_distance(cameras, photos.box.mean(axis=0)))][: plan.free_space]
 
 
+def explain_gains(plan: RadiancePlan) -> list[PlanLine]:
+    """Return a line if photographs have gains."""
+    return [GAINS if plan.agree else KEPT_GAINS][: plan.exposure]
+
+
 def explain_degree(plan: RadiancePlan, photographs: int) -> PlanLine:
     """Return the degree of the harmonics, and whether the number of photographs set it."""
     is_few = plan.few_degree is not None and photographs < FEW_PHOTOGRAPHS
     why = f"; fewer than {FEW_PHOTOGRAPHS} photographs overfit higher degrees" if is_few else ""
     reason = f"{(plan.degree + 1) ** 2} numbers a colour and node{why}"
-    return PlanLine(choice=f"harmonics of degree {plan.degree}", reason=reason)
+    first = f", {plan.degree_at(0)} in the first stage" if plan.degree_at(0) < plan.degree else ""
+    return PlanLine(choice=f"harmonics of degree {plan.degree}{first}", reason=reason)
 
 
 def explain_steps(plan: RadiancePlan) -> PlanLine:

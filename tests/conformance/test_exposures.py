@@ -1,9 +1,10 @@
-"""Exposures of photographs by their common points: known gains, and whether a fit of Gaussians has gains."""
+"""Exposures of photographs by their common points: known gains, and whether fits have gains."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from photo_sets import write_colmap
 from PIL import Image
 
 from mivol import config
+from mivol.experiments.field_fit import explain_gains, keep_gains
 from mivol.experiments.gaussian_fit import make_gaussian_plan, start_gaussians
+from mivol.optim.photographs.radiance_plan import PRESETS
 from mivol.photos import Photo, load_photos
 from mivol.photos.exposures import DIFFER, FEWEST, measure_exposures
 
@@ -68,3 +71,16 @@ def test_gaussians_have_gains_if_exposures_differ(variant_rgb: str, tmp_path: Pa
     reasons = [line.reason for line in start.lines if "gains" in line.choice]
     facts = "common points differ in brightness by 26% between photographs, and by 51% from what the nearest photographs"
     assert reasons == [f"{facts} predict"] * has_gains
+
+
+@pytest.mark.parametrize(("turns", "kept"), [(-1.0, True), (1.0, False)], ids=["differ", "predicted"])
+def test_grids_keep_gains_if_exposures_differ(turns: float, kept: bool) -> None:
+    """Pairs of opposite gains, which neighbours do not predict, and of equal gains. Without gains nothing is measured."""
+    steps = 0.1 * np.array([1.0, -1, 1, -1, 2, -2, 0.5, -0.5])
+    photos = SimpleNamespace(views=photograph(np.exp(np.ravel(np.column_stack([steps, turns * steps])))))
+    plan = PRESETS["capture"]
+    assert keep_gains(plan, photos) == (replace(plan, agree=0.0) if kept else plan)
+    line = explain_gains(keep_gains(plan, photos))[0]
+    assert ("common points differ" in line.reason) == kept != ("if the photographs differ" in line.choice)
+    without = replace(plan, exposure=False)
+    assert keep_gains(without, photos) == without and explain_gains(without) == []

@@ -378,6 +378,12 @@ def test_colours_of_few_photographs_do_not_decay(photos: Photos) -> None:
     assert found(preset="cpu") == [(12, 2), (12, 2)]
 
 
+def test_the_degree_of_the_first_stage_is_named() -> None:
+    plan = replace(PRESETS["capture"], degree=1, first_degree=0)
+    assert field_fit.explain_degree(plan, 60).choice == "harmonics of degree 1, 0 in the first stage"
+    assert field_fit.explain_degree(replace(plan, first_degree=None), 60).choice == "harmonics of degree 1"
+
+
 def test_nested_boxes_are_those_that_points_and_cameras_need(photos: Photos, photographs: Path, tmp_path: Path) -> None:
     """Points up to 6 half edges from the middle need 4 boxes of 5, and so do cameras at half that distance; the plan says what
     is left out, and where cameras stand."""

@@ -18,9 +18,8 @@ from mivol.experiments.field_fit import GAINS, explain_plan, make_plan
 from mivol.experiments.photo_fit import tabulate_gains
 from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.loop import begin_fit
-from mivol.optim.photographs import radiance_problem
 from mivol.optim.photographs.field_view import render_view
-from mivol.optim.photographs.photo_colours import AGREE, GAIN_PULL, GAIN_RATE, Exposure, pull_at
+from mivol.optim.photographs.photo_colours import GAIN_PULL, GAIN_RATE, Exposure, pull_at
 from mivol.optim.photographs.radiance_plan import PRESETS, RadiancePlan, RadianceStage
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
@@ -100,7 +99,7 @@ def test_gain_cancels_the_exposure_of_a_brighter_photograph(variant_rgb: str) ->
 
 @pytest.mark.parametrize(
     ("spread", "said"),
-    [(0.9 * AGREE, "photographs agree in exposure to 3.6%, so gains are removed"), (1.1 * AGREE, "")],
+    [(0.9 * SMALL.agree, "photographs agree in exposure to 3.6%, so gains are removed"), (1.1 * SMALL.agree, "")],
     ids=["agree", "differ"],
 )
 def test_gains_of_equal_exposures_are_removed(variant_rgb: str, spread: float, said: str) -> None:
@@ -163,11 +162,8 @@ def test_report_sorts_gains_by_distance_from_1() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("agree", [1.0, 0.0], ids=["agree", "differ"])
-def test_resumed_fit_equals_an_uninterrupted_fit(
-    one_thread, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agree: float
-) -> None:
+def test_resumed_fit_equals_an_uninterrupted_fit(one_thread, tmp_path: Path, agree: float) -> None:
     """To the last bit, before and after gains were left out."""
-    monkeypatch.setattr(radiance_problem, "AGREE", agree)
     batches, path = RayBatches.from_photos(capture_photos.capture(6, 0.3)), tmp_path / "checkpoint.npz"
 
     def run(store: CheckpointFile, until: int) -> object:
@@ -176,7 +172,7 @@ def test_resumed_fit_equals_an_uninterrupted_fit(
             fit.advance()
         return fit
 
-    plan = replace(SMALL, stages=(RadianceStage(8, 10, 1, 3, 8), RadianceStage(16, 10, 1, 3, 8)))
+    plan = replace(SMALL, agree=agree, stages=(RadianceStage(8, 10, 1, 3, 8), RadianceStage(16, 10, 1, 3, 8)))
     for stop in (7, 14):
         whole = run(CheckpointFile(path, {}), stop)
         whole.save()

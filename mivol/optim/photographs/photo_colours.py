@@ -163,10 +163,6 @@ GAIN_RATE = 0.01
 GAIN_PULL = 0.2
 """Share of a logarithm, times the learning rate, by which the logarithm falls per step: initially 0.2 %."""
 
-AGREE = 0.04
-"""Spread (root mean square of the logarithms) after the first stage below which photographs count as equally exposed, and the
-gains are removed. A tenth of a stop is 0.03."""
-
 
 @dataclass(frozen=True)
 class Exposure:

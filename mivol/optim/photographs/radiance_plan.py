@@ -89,6 +89,8 @@ class RadiancePlan:
         sky_rate: initial learning rate of the sky [radiance]; a low rate would let the field fill the box with the background.
         sky_smooth: share by which a texel moves to its neighbours per step; no texel then stays at its start.
         exposure: whether photographs have a gain per channel (:mod:`mivol.optim.photographs.photo_colours`), if they disagree.
+        agree: spread of the gains (root mean square of the logarithms) after the first stage below which photographs count as
+            equally exposed, and the gains are removed. A tenth of a stop is 0.03.
         poses: whether the cameras of the photographs move with the fit.
         align_every: steps between two corrections of the cameras, if they move.
         levels: number of nested boxes, each of twice the extent (:mod:`mivol.fields.spherical_grid`).
@@ -134,6 +136,7 @@ class RadiancePlan:
     sky_rate: float = 0.1
     sky_smooth: float = 0.0
     exposure: bool = False
+    agree: float = 0.04
     poses: bool = False
     align_every: int = 25
     levels: int = 1

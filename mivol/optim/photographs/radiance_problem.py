@@ -44,7 +44,7 @@ from mivol.optim.photographs.batch_gradient import (
     move_numbers,
     move_rows,
 )
-from mivol.optim.photographs.photo_colours import AGREE, GAIN_RATE, SCALES, Exposure, pull_at
+from mivol.optim.photographs.photo_colours import GAIN_RATE, SCALES, Exposure, pull_at
 from mivol.optim.photographs.radiance_plan import RadiancePlan
 from mivol.optim.photographs.ray_batches import POINTS_PER_VIEW, DepthRays, RayBatch, RayBatches, sample_depth_rays
 from mivol.optim.priors import Neighbours, Rows
@@ -380,7 +380,7 @@ class RadianceProblem(SparseProblem, DividedProblem):
         if not self.has_gains or stage != 1:
             return ""
         spread = self.exposure.spread
-        if spread < AGREE:
+        if spread < self.plan.agree:
             self.exposure, self.has_gains = Exposure.neutral(len(self.batches.origins)), False
             return f"; photographs agree in exposure to {spread:.1%}, so gains are removed"
         return f"; photographs differ in exposure by {spread:.0%}, so each has gains"
