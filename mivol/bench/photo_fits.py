@@ -173,7 +173,7 @@ def prepare_fit(
     train = change(add_box(chosen, train))
     if isinstance(chosen, config.FieldExperiment):
         plan = adapt_plan(adapt(make_plan(chosen)), train)
-        problem = RadianceProblem(make_batches(plan, train), train.box, plan)
+        problem = RadianceProblem(make_batches(plan, train), train.box, plan, seed)
         return PhotoProblem(problem, train, judged, sum(stage.steps for stage in plan.stages))
     if isinstance(chosen, config.OctreeExperiment):
         planned, _, batches = adapt_octree_plan(make_octree_plan(chosen), find_preset(chosen.field), train)
