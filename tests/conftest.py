@@ -135,8 +135,17 @@ def record(request: pytest.FixtureRequest) -> bool:
 def variant_rgb(request: pytest.FixtureRequest) -> str:
     """An rgb variant with derivatives is active in each test that asks for no other; its name."""
     name = request.config.getoption("--variant")
-    mi.set_variant(name)
+    # Each switch compiles Mitsuba's integrators anew, and at a thousand functions Dr.Jit warns.
+    if "each_variant" not in request.fixturenames:
+        mi.set_variant(name)
     return name
+
+
+@pytest.fixture(params=["llvm_ad_rgb", "llvm_ad_mono"])
+def each_variant(request: pytest.FixtureRequest) -> str:
+    """Each JIT variant of the CPU for rgb and mono, one after the other; its name."""
+    mi.set_variant(request.param)
+    return request.param
 
 
 @pytest.fixture

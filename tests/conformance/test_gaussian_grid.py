@@ -23,11 +23,6 @@ from mivol.files import encode_srgb
 from mivol.points.gaussians import CONSTANT_HARMONIC, Gaussians, concatenate, logit
 
 
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-
-
 def one(scales: tuple[float, ...] = (1.0, 1.0, 1.0), opacity: float = 0.7, mean: tuple[float, ...] = (0, 0, 0)) -> Gaussians:
     """A turned Gaussian with a directional colour."""
     harmonics = np.linspace(-0.5, 0.8, 12).reshape(1, 4, 3)

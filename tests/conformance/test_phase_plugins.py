@@ -18,14 +18,6 @@ from scenes import box_of, camera, render, sky
 
 ROOT = Path(__file__).parents[2]
 EPS = 2.0**-23
-VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono")
-
-
-@pytest.fixture(params=VARIANTS)
-def variant(request):
-    """Each JIT variant of the CPU for rgb and mono, one after the other: every test switches back and forth."""
-    mi.set_variant(request.param)
-    return request.param
 
 
 def grid(values: np.ndarray, kind: str = "gridvolume") -> dict:
@@ -98,7 +90,7 @@ def value_and_pdf(phase: mi.PhaseFunction, mei: mi.MediumInteraction3f, wo: mi.V
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", PHASES)
-def test_chi_square(variant, name):
+def test_chi_square(each_variant, name):
     """Samples are distributed as eval_pdf says."""
     given = PHASES[name]
     sample, pdf = mi.chi2.PhaseFunctionAdapter(given["type"], given)
@@ -112,7 +104,7 @@ def test_chi_square(variant, name):
 
 
 @pytest.mark.parametrize("name", PHASES)
-def test_normalised_and_reciprocal_and_weighted_by_value_over_pdf(variant, name):
+def test_normalised_and_reciprocal_and_weighted_by_value_over_pdf(each_variant, name):
     phase = mi.load_dict(PHASES[name])
     # Normalised: a mean over a quadrature in the cosine (in pieces, for the corners of tables) at one azimuth.
     corners = np.unique(np.concatenate([PEAK.cosines, [0.99, 0.999]]))
@@ -141,7 +133,7 @@ def test_normalised_and_reciprocal_and_weighted_by_value_over_pdf(variant, name)
     assert np.max(np.abs(np.linalg.norm(np.array(wo), axis=0) - 1)) <= 4 * EPS
 
 
-def test_convention_of_directions(variant):
+def test_convention_of_directions(each_variant):
     """wi points back: straight on is -wi. The checks of Mitsuba's tests of tabphase, on irregular cosines."""
     phase = mi.load_dict({"type": "mivol_tabulated", "values": "0, 0.5, 1"})
     wo, _, pdf = phase.sample(mi.PhaseFunctionContext(), interaction([0, 0, 1]), 0.0, mi.Point2f(1, 0))
@@ -154,7 +146,7 @@ def test_convention_of_directions(variant):
     assert np.max(np.abs(value - want)) <= 8 * EPS
 
 
-def test_flags_and_projected_area(variant):
+def test_flags_and_projected_area(each_variant):
     for given in PHASES.values():
         phase = mi.load_dict(given)
         assert mi.has_flag(phase.flags(), mi.PhaseFunctionFlags.Anisotropic)
@@ -165,7 +157,7 @@ def test_flags_and_projected_area(variant):
 
 
 @pytest.mark.parametrize("name", CLOSED_FORMS)
-def test_derivatives_by_parameters_are_differences_of_values(variant, name):
+def test_derivatives_by_parameters_are_differences_of_values(each_variant, name):
     """Each parameter of each closed form, at its default, against central differences of two steps."""
     phase, mei, wo = mi.load_dict(CLOSED_FORMS[name]), interaction(directions(64, 20)), vector(directions(64, 21))
     params = mi.traverse(phase)
@@ -191,7 +183,7 @@ def test_derivatives_by_parameters_are_differences_of_values(variant, name):
 # -- Loading -----------------------------------------------------------------------------------------------------------------
 
 
-def test_xml(variant, tmp_path):
+def test_xml(each_variant, tmp_path):
     (tmp_path / "drops.csv").write_text("angle,value\n0,3\n90,1\n180,2\n")
     scenes = {
         **{
@@ -237,7 +229,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("given", "words"), BAD, ids=[str(i) for i in range(len(BAD))])
-def test_what_cannot_be_is_refused(variant, given, words):
+def test_what_cannot_be_is_refused(each_variant, given, words):
     with pytest.raises(Exception, match=words):
         mi.load_dict(given)
 
@@ -282,7 +274,7 @@ def test_spectral_and_polarised_variants():
 
 
 @pytest.mark.parametrize("kind", ["gridvolume", "mivol_voxels"])
-def test_volumes_are_evaluated_where_light_scatters(variant, kind):
+def test_volumes_are_evaluated_where_light_scatters(each_variant, kind):
     """g and a weight as grids of one voxel on either side: as the float in each half."""
     g, w = np.zeros((1, 1, 2)), np.zeros((1, 1, 2))
     g[..., 0], g[..., 1] = 0.2, 0.7
@@ -307,7 +299,7 @@ def test_volumes_are_evaluated_where_light_scatters(variant, kind):
             assert np.max(np.abs(got / want - 1)) <= 40 * EPS
 
 
-def test_keys(variant):
+def test_keys(each_variant):
     box = {
         "type": "mivol_mixture",
         "a": {"type": "mivol_hg", "g": grid(np.full((2, 2, 2), 0.5))},
@@ -324,7 +316,7 @@ def test_keys(variant):
         assert not params.flags(key) & mi.ParamFlags.NonDifferentiable
 
 
-def test_updates_are_seen(variant):
+def test_updates_are_seen(each_variant):
     phase = mi.load_dict(PHASES["mixture"])
     params = mi.traverse(phase)
     params["front.g"], params["weight_back"] = 0.1, 0.0
@@ -359,7 +351,7 @@ PAIRS = {
 
 
 @pytest.mark.parametrize("name", PAIRS)
-def test_values_are_those_of_stock(variant, name):
+def test_values_are_those_of_stock(each_variant, name):
     ours, stock = (mi.load_dict(given) for given in PAIRS[name])
     a, b = interaction(directions(1024, 11)), vector(directions(1024, 12))
     got, want = value_and_pdf(ours, a, b)[0], value_and_pdf(stock, a, b)[0]
@@ -367,7 +359,7 @@ def test_values_are_those_of_stock(variant, name):
     assert np.max(np.abs(got / want - 1)) <= 16 * EPS
 
 
-def test_components_of_a_mixture_are_those_of_a_blend(variant):
+def test_components_of_a_mixture_are_those_of_a_blend(each_variant):
     """One lobe alone: values and densities times its share, samples of that lobe whatever the first number is."""
     lobes = ({"type": "hg", "g": 0.2}, {"type": "isotropic"})  # stock rayleigh counts as no component at all
     ours = mi.load_dict({"type": "mivol_mixture", "a": lobes[0], "b": lobes[1], "weight_a": 0.3, "weight_b": 0.7})
@@ -387,14 +379,14 @@ def test_components_of_a_mixture_are_those_of_a_blend(variant):
 
 
 @pytest.mark.parametrize(("name", "count"), [("hg", 1), ("mivol_rayleigh", 1), ("draine", 1), ("table", 1), ("mixture", 3)])
-def test_components_are_counted(variant, name, count):
+def test_components_are_counted(each_variant, name, count):
     """One for each lobe, as stock ``hg`` and ``isotropic`` count; each has the flags of its lobe."""
     phase = mi.load_dict(PHASES[name])
     assert phase.component_count() == count
     assert [phase.flags(k) for k in range(count)] == [int(mi.PhaseFunctionFlags.Anisotropic)] * count
 
 
-def test_components_of_nested_mixtures_add_up(variant):
+def test_components_of_nested_mixtures_add_up(each_variant):
     """A component within a mixture within a mixture is the share of its lobe of the share of the inner one."""
     inner = {"type": "mivol_mixture", "c": {"type": "mivol_hg", "g": 0.3}, "d": {"type": "isotropic"}}
     ours = mi.load_dict({"type": "mivol_mixture", "a": inner, "b": {"type": "mivol_rayleigh"}})
@@ -411,7 +403,7 @@ def test_components_of_nested_mixtures_add_up(variant):
         assert dr.all(ours.eval_pdf(ctx, mei, wo)[0] == share * want, axis=None)
 
 
-def test_stock_blend_does_not_number_ours(variant):
+def test_stock_blend_does_not_number_ours(each_variant):
     """Mitsuba 3.9 keeps the count that its blend reads from Python. Once it no longer does, ours can be set."""
     lobes = {"a": {"type": "mivol_hg"}, "b": {"type": "hg"}}
     assert mi.load_dict({"type": "blendphase", "weight": 0.5, **lobes}).component_count() == 1
@@ -548,7 +540,7 @@ def test_gradient_of_a_recording(name):
         assert np.any(plain != 0)
 
 
-def test_samples_carry_no_derivative_and_values_do(variant):
+def test_samples_carry_no_derivative_and_values_do(each_variant):
     for given, key in ((phase, key) for phase, key, _ in FROZEN.values()):
         phase = mi.load_dict(given)
         params = mi.traverse(phase)

@@ -16,15 +16,6 @@ from mivol.errors import MivolError
 from mivol.fields import voxels
 from scenes import FRAMES, as_float32, box_of, camera, grid_volume, medium, refused, render, sky, tensor, transform
 
-VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono")
-
-
-@pytest.fixture(params=VARIANTS)
-def variant(request):
-    """Each JIT variant of the CPU for rgb and mono, one after the other: every test switches back and forth."""
-    mi.set_variant(request.param)
-    return request.param
-
 
 def grid(seed=0, channels=1):
     return as_float32(np.random.default_rng(seed).uniform(0, 2, (5, 6, 7, channels)))
@@ -45,7 +36,7 @@ def vol_file(path, values):
 # -- Loading -------------------------------------------------------------------------------------------------------------
 
 
-def test_volume_from_dict_and_xml(variant, tmp_path):
+def test_volume_from_dict_and_xml(each_variant, tmp_path):
     values = grid()
     path = vol_file(tmp_path / "smoke.vol", values)
     xml = f"""<volume version="3.0.0" type="mivol_voxels"><string name="filename" value="{path}"/>
@@ -64,7 +55,7 @@ def test_volume_from_dict_and_xml(variant, tmp_path):
         assert np.array_equal(np.array([volume.bbox().min, volume.bbox().max]).reshape(2, 3), [[1, 0, 0], [3, 2, 2]])
 
 
-def test_medium_and_integrator_from_xml(variant, tmp_path):
+def test_medium_and_integrator_from_xml(each_variant, tmp_path):
     path = vol_file(tmp_path / "smoke.vol", grid())
     scene = mi.load_string(f"""
         <scene version="3.0.0">
@@ -90,7 +81,7 @@ def test_medium_and_integrator_from_xml(variant, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["mivol_voxels", "mivol_medium", "mivol"])
-def test_unknown_property_is_an_error(variant, kind):
+def test_unknown_property_is_an_error(each_variant, kind):
     needed = {
         "mivol_voxels": {"data": tensor(grid())},
         "mivol_medium": {"sigma_t": grid_volume("mivol_voxels", grid()), "albedo": 0.0},
@@ -145,7 +136,7 @@ def test_spectral_and_polarised_variants_are_refused_by_name(name):
 
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("channels", [1, 3])
-def test_values_equal_gridvolume_bit_for_bit(variant, frame, channels):
+def test_values_equal_gridvolume_bit_for_bit(each_variant, frame, channels):
     values = grid(1, channels)
     ours, stock = (mi.load_dict(grid_volume(kind, values, FRAMES[frame])) for kind in ("mivol_voxels", "gridvolume"))
     rng = np.random.default_rng(2)
@@ -160,7 +151,7 @@ def test_values_equal_gridvolume_bit_for_bit(variant, frame, channels):
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_vacuum_outside_the_box(variant, channels):
+def test_vacuum_outside_the_box(each_variant, channels):
     # Where gridvolume goes on for ever with its border values, and a stock medium fills the bounding box of a rotated
     # grid with them, there is nothing.
     volume = mi.load_dict(grid_volume("mivol_voxels", np.ones((2, 3, 4, channels)), FRAMES["rotated"]))
@@ -173,7 +164,7 @@ def test_vacuum_outside_the_box(variant, channels):
 
 @pytest.mark.slow_for("llvm_ad_rgb-rotated")
 @pytest.mark.parametrize("frame", [pytest.param("unit", marks=pytest.mark.slow), "rotated"])
-def test_same_picture_as_gridvolume_under_stock_medium_and_volpath(variant, frame):
+def test_same_picture_as_gridvolume_under_stock_medium_and_volpath(each_variant, frame):
     # Same numbers, same random numbers, same paths: the pictures differ at most by the order of float sums in a pixel.
     to_world = as_float32(FRAMES[frame])
     images = []
@@ -187,7 +178,7 @@ def test_same_picture_as_gridvolume_under_stock_medium_and_volpath(variant, fram
     assert np.all(np.abs(images[0] - images[1]) <= 16 * 2.0**-23 * (1 + images[1]))
 
 
-def test_grid_bbox_of_the_file_is_used(variant, tmp_path):
+def test_grid_bbox_of_the_file_is_used(each_variant, tmp_path):
     values = mi.VolumeGrid(grid()[..., 0].astype(np.float32))
     path = str(tmp_path / "placed.vol")
     values.write(path)
@@ -215,7 +206,7 @@ def traversed(interior):
     return mi.traverse(scene)
 
 
-def test_keys_are_those_of_mitsuba(variant):
+def test_keys_are_those_of_mitsuba(each_variant):
     sigma_t, albedo = grid_volume("mivol_voxels", grid()), grid_volume("mivol_voxels", np.full((2, 2, 2, 1), 0.5))
     ours = traversed(medium("mivol_medium", sigma_t, albedo))
     stock = traversed(medium("heterogeneous", grid_volume("gridvolume", grid()), albedo))
@@ -226,20 +217,20 @@ def test_keys_are_those_of_mitsuba(variant):
     assert ours.flags(prefix + "sigma_t.data") == stock.flags(prefix + "sigma_t.data")
 
 
-def test_keys_of_absorption_and_scattering(variant):
+def test_keys_of_absorption_and_scattering(each_variant):
     volume = grid_volume("mivol_voxels", grid())
     params = traversed({"type": "mivol_medium", "sigma_a": volume, "sigma_s": 0.0})
     assert "smoke.interior_medium.sigma_a.data" in params
 
 
-def test_scale_is_differentiable(variant):
+def test_scale_is_differentiable(each_variant):
     params = traversed(medium("mivol_medium", grid_volume("mivol_voxels", grid()), scale=2.0))
     key = "smoke.interior_medium.scale"
     assert params.flags(key) & mi.ParamFlags.NonDifferentiable == 0
 
 
 @pytest.mark.slow_for("llvm_ad_rgb")
-def test_update_of_the_data_is_seen(variant):
+def test_update_of_the_data_is_seen(each_variant):
     parts = {
         "smoke": box_of(medium("mivol_medium", grid_volume("mivol_voxels", grid(6))), np.eye(4)),
         "sky": sky(),
@@ -260,7 +251,7 @@ def test_update_of_the_data_is_seen(variant):
 
 
 @pytest.mark.slow_for("llvm_ad_mono")
-def test_gradients_arrive_at_stock_keys(variant):
+def test_gradients_arrive_at_stock_keys(each_variant):
     # d image / d sigma_t of a constant grid along rays of length about 1: -T, in sum over the voxels.
     for kind, volume in (("heterogeneous", "gridvolume"), ("mivol_medium", "mivol_voxels")):
         smoke = medium(kind, grid_volume(volume, np.full((4, 4, 4, 1), 0.7)))
@@ -287,12 +278,12 @@ def test_gradients_arrive_at_stock_keys(variant):
         ({}, "sigma_t"),
     ],
 )
-def test_medium_wants_one_pair_of_coefficients(variant, given, named):
+def test_medium_wants_one_pair_of_coefficients(each_variant, given, named):
     with pytest.raises(Exception, match=named):
         mi.load_dict({"type": "mivol_medium", **given})
 
 
-def test_absorption_and_scattering_are_the_same_medium(variant):
+def test_absorption_and_scattering_are_the_same_medium(each_variant):
     sensor = camera([0.5, 0.4, 4], [0.5, 0.5, 0.5], 4, fov=5)
     images = []
     for given in (
@@ -306,7 +297,7 @@ def test_absorption_and_scattering_are_the_same_medium(variant):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0])
-def test_bad_voxels_are_named(variant, bad):
+def test_bad_voxels_are_named(each_variant, bad):
     """Hard case 27."""
     values = grid()
     values[3, 1, 4, 0] = bad
@@ -314,7 +305,7 @@ def test_bad_voxels_are_named(variant, bad):
         mi.load_dict(grid_volume("mivol_voxels", values))
 
 
-def test_signed_voxels_are_a_g_and_no_extinction(variant):
+def test_signed_voxels_are_a_g_and_no_extinction(each_variant):
     """Back-scattering voxels; NaN is refused as ever, and negative numbers count as 0 where they would be an extinction."""
     values = grid()
     values[3, 1, 4, 0] = -0.9
@@ -331,13 +322,13 @@ def test_signed_voxels_are_a_g_and_no_extinction(variant):
         render(scene, {"type": "mivol"}, 1)
 
 
-def test_degenerate_place_is_refused(variant):
+def test_degenerate_place_is_refused(each_variant):
     """Hard case 49."""
     with pytest.raises(Exception, match="degenerate|invert|singular"):
         mi.load_dict(grid_volume("mivol_voxels", grid(), np.diag([1.0, 0, 1, 1])))
 
 
-def test_a_rotation_about_an_axis_of_another_length_is_refused(variant):
+def test_a_rotation_about_an_axis_of_another_length_is_refused(each_variant):
     """Mitsuba takes the axis as it is for the matrix and its transpose for the inverse, which it then is not."""
     place = mi.ScalarTransform4f().rotate([1, 1, 0], 40)
     with pytest.raises(Exception, match="rotate about an axis of length 1"):
@@ -347,7 +338,7 @@ def test_a_rotation_about_an_axis_of_another_length_is_refused(variant):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_an_update_with_bad_values_is_refused(variant, bad):
+def test_an_update_with_bad_values_is_refused(each_variant, bad):
     """What an optimizer's overshoot leaves behind is named when it is handed in, not when it is rendered.
 
     Hard cases 26 and 27.
@@ -360,7 +351,7 @@ def test_an_update_with_bad_values_is_refused(variant, bad):
         params.update()
 
 
-def test_update_may_change_the_resolution(variant):
+def test_update_may_change_the_resolution(each_variant):
     """Three channels are stored padded: the texture has to be rebuilt."""
     volume = mi.load_dict(grid_volume("mivol_voxels", grid(channels=3)))
     params = mi.traverse(volume)
