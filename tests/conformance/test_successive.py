@@ -16,7 +16,7 @@ from false_alarms import assert_precise, assert_same_mean, difference, over_pixe
 from scattering_scenes import PLACE, close_up, mivol, moments, rough_grid, smoke, sun
 
 from mivol.experiments.script import explain
-from mivol.scene import choices, plan
+from mivol.scene import choices, plan, render_tasks
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import build_estimators, make_plan
 from mivol.scene.survey import BranchNoise, survey_scene
@@ -263,3 +263,17 @@ def test_branches_keep_the_mean(parts: Callable[[], dict], monkeypatch: pytest.M
     whole, branched = found
     assert_same_mean(branched, whole, rounding=1e-6, what="radiance")
     assert_precise(difference(branched, whole), 0.03 * whole.mean, what="radiance")
+
+
+def test_a_large_image_has_a_kernel_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its paths are those of the kernel that smaller images share with stems and branches, and pass through no memory."""
+    calls = []
+    monkeypatch.setattr(render_tasks, "walk_light", lambda *given, **more: calls.append(1) or walk_light(*given, **more))
+    scene = close_up({"matter": smoke(rough_grid(7, 6.0), 0.9)[0], "sky": sky()}, res=8)
+    pictures = []
+    for least in (1 << 16, 1):
+        monkeypatch.setattr(render_tasks, "OWN_KERNEL", least)
+        pictures.append(np.array(mi.render(scene, integrator=mi.load_dict(mivol(max_depth=5)), spp=4, seed=3)))
+    assert len(calls) == 1
+    # Sums of 4 samples a pixel of some ten factors each.
+    np.testing.assert_allclose(pictures[1], pictures[0], rtol=4 * 10 * 2.0**-24)

@@ -35,7 +35,6 @@ from mivol.transport.path.walk import (
     begin_path,
     film_alpha,
     leave_camera,
-    leave_camera_from_memory,
     walk_light,
 )
 from mivol.transport.traversal.random_numbers import SpreadSampler
@@ -146,13 +145,14 @@ def walk_branching(
     tabulated shadows.
     """
     n, first = dr.width(ray), sampler.clone()
-    light, alpha, stems = walk_light(estimators, leave_camera_from_memory(estimators, sampler, ray), stops=True)
+    # Branches are for images of many samples, to which passing the starts through memory costs more than a kernel of its own.
+    light, alpha, stems = walk_light(estimators, leave_camera(estimators, sampler, ray).with_flight(), stops=True, shares=False)
     ends = PathStart.at_stop(stems, first)
     collided, found = dr.zeros(mi.UInt32, n), _WorkList(dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, 0))
     dr.scatter(collided, dr.arange(mi.UInt32, n), *found.take(ends.active))
     L, events = dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n)
     kept = KeptShadow.empty(n) if estimators.tabulates_shadows else None
-    dr.eval(ends, found.taken, collided, L, events, kept)
+    dr.eval(light, alpha, ends, found.taken, collided, L, events, kept)
     lanes, each = -(-n // paths_per_lane(BRANCHED_PATHS, n)), dr.opaque(mi.UInt32, count)
     todo = _WorkList(found.taken, dr.opaque(mi.UInt32, 0))
 

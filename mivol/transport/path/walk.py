@@ -179,8 +179,7 @@ class PathStart:
             dr.scatter(stored, values, lane)
             return stored
 
-        ray, sampler = FineRay.from_ray(self.ray), self.sampler
-        flight = self.flight or KnownFlight(mi.Float64(0), mi.UInt32(0), mi.Bool(False))
+        ray, sampler, flight = FineRay.from_ray(self.ray), self.sampler, self.with_flight().flight
         return PathStart(
             FineRay(*(write(values) for values in (ray.o, ray.d, ray.maxt, ray.time)), ray.wavelengths),
             *(write(values) for values in (self.medium, self.beta, self.eta, self.depth)),
@@ -189,6 +188,11 @@ class PathStart:
             KnownFlight(*(write(values) for values in (flight.t, flight.body, flight.on))),
             write(self.at_collision),
         )
+
+    def with_flight(self) -> PathStart:
+        """The same start, with flights that are known in no lane in place of None."""
+        none = KnownFlight(mi.Float64(0), mi.UInt32(0), mi.Bool(False))
+        return replace(self, flight=none) if self.flight is None else self
 
     def clone(self) -> PathStart:
         """The same start for another walk, which draws the same numbers: a walk advances the sampler of its start."""
@@ -353,23 +357,28 @@ def walk_part(
     return _add_reservoirs(estimators, _walk_from_collision(estimators, path, at, stops))
 
 
-def walk_light(estimators: Estimators, start: PathStart, stops: bool) -> tuple[mi.Spectrum, mi.Float, Path]:
-    """Find the light of paths from a kernel that images, stems and branches share, so that it is compiled once.
+def walk_light(
+    estimators: Estimators, start: PathStart, stops: bool, shares: bool = True
+) -> tuple[mi.Spectrum, mi.Float, Path]:
+    """Find the light of paths.
 
     Args:
         estimators: estimators of the render; their segments end in media.
-        start: starts of the paths in memory (:func:`leave_camera_from_memory`, :meth:`PathStart.in_memory`).
+        start: starts of the paths.
         stops: whether the paths are stems, which end at their first collision.
+        shares: whether images, stems and branches share the kernel of the walk, so that it is compiled once. Their starts are
+            in memory then (:func:`leave_camera_from_memory`, :meth:`PathStart.in_memory`), and the results are evaluated.
 
     Returns:
-        Radiance, alpha for the film (in [0, 1]), and the paths at their ends, evaluated.
+        Radiance, alpha for the film (in [0, 1]), and the paths at their ends.
     """
     stem = dr.opaque(mi.Bool, stops)
-    begin_kernel(start, stem)
+    if shares:
+        begin_kernel(start, stem)
     path = walk_part(estimators, start, Primal(dr.zeros(mi.Spectrum, dr.width(start.ray))), stem)
     alpha = dr.select(path.known.on, 1, film_alpha(path))
-    end = path.ray, path.medium, path.beta, path.eta, path.depth, path.known
-    begin_kernel(path.score.L, alpha, end)
+    if shares:
+        begin_kernel(path.score.L, alpha, (path.ray, path.medium, path.beta, path.eta, path.depth, path.known))
     return path.score.L, alpha, path
 
 
