@@ -15,6 +15,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.fields.protocol import BOUNDED, accumulate_tracked
+from mivol.files.volume import frame_from_box
 from mivol.scene_graph import list_values, traverse
 
 __all__ = ["PluginField"]
@@ -44,8 +45,7 @@ class PluginField:
         if not (np.isfinite(high - low).all() and (high > low).all()):
             found = f"the volume {self.kind} has the bounding box {low} to {high}"
             raise MivolError(f"{found}; a finite box is expected: give to_world.")
-        self.to_world = np.eye(4)
-        self.to_world[:3] = np.c_[np.diag(high - low), low]
+        self.to_world = frame_from_box(low, high)
         self.channels = 1 if mi.is_monochromatic or volume.channel_count() == 1 else 3
 
     def eval(self, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> list[mi.Float]:

@@ -151,11 +151,11 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, grids: StockGrid
         parts, albedo, emission_arrays = [_part_of_field(emission, level)], mi.Float(0), []
         if isinstance(parts[0], GaussianExtinction):
             emission = None  # their light is in their order along a ray: no function of place has it
-    fields = {"emission_density": emission_density, "emission": emission, "albedo": albedo}
-    fields = fields if emission is not None or emission_density is not None else {}
-    for name, field_of_light in fields.items():
-        _check_cells(name, field_of_light, boundary, grids)
-    light = list(fields.values())
+    light = []
+    if emission is not None or emission_density is not None:
+        light = [emission_density, emission, albedo]
+        for name, volume in zip(("emission_density", "emission", "albedo"), light, strict=True):
+            _check_cells(name, params, volume, boundary, grids)
     emission_lattice = _emission_lattice(emission_density, light, boundary, grids)
     stock_boxes = {v.ptr: Box(grids.place(v, boundary)) for v in light if _repeats_border(v)}
     numbers = {k.partition(".")[0]: v for k, v in values if k in ("scale", *(f"{n}.value.value" for n in names))}
@@ -252,17 +252,17 @@ def _emission_lattice(emission_density: object, others: list, boundary: Box | No
     return Lattice(dr.zeros(mi.TensorXf, (z, y, x, 1)), grids.place(lead, boundary))
 
 
-def _check_cells(name: str, volume: object, boundary: Box | None, grids: StockGrids) -> None:
+def _check_cells(name: str, params: mi.SceneParameters, volume: object, boundary: Box | None, grids: StockGrids) -> None:
     """Refuse a volume that the emission of a medium cannot be summed with: its values are not trilinear in the cells of a grid.
 
     Raises:
         MivolError: a volume of another package, or a stock grid with another filter or with borders that are not clamped.
     """
-    if not _is_grid(volume) or hasattr(volume, "mivol_to_world") or hasattr(volume, "mivol_field"):
+    if not _repeats_border(volume):
         return
     found = f"a volume {type(volume).__name__}"
     if volume.class_name() == "GridVolume":
-        if grids.is_trilinear(volume, Lattice(_tensor(traverse(volume)["data"]), grids.place(volume, boundary))):
+        if grids.is_trilinear(volume, Lattice(_tensor(params[f"{name}.data"]), grids.place(volume, boundary))):
             return
         found = "a gridvolume with another filter_type than trilinear or another wrap_mode than clamp"
     raise MivolError(f"the {name} of a medium that emits is {found}; expected a trilinear grid: sample it to a mivol_voxels.")

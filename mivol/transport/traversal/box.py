@@ -159,13 +159,13 @@ def _find_unit_corners(world: np.ndarray) -> np.ndarray | None:
     corners, which = np.unique(world, axis=0, return_inverse=True)
     if len(corners) != 8:
         return None
-    bits = np.indices((2, 2, 2)).reshape(3, 8).T
+    unit = Box(np.eye(4)).corners()
     tolerance = 4 * 2.0**-24 * np.abs(corners).max()  # each coordinate of a vertex was rounded to float32
     for edges in itertools.combinations(corners[1:] - corners[0], 3):
-        apart = np.abs(corners[:, None] - (corners[0] + bits @ np.array(edges))).max(axis=2)
+        apart = np.abs(corners[:, None] - (corners[0] + unit @ np.array(edges))).max(axis=2)
         nearest = apart.argmin(axis=1)
         if apart.min(axis=1).max() <= tolerance and len(set(nearest)) == 8:
-            return bits[nearest][which.reshape(-1)].astype(float)
+            return unit[nearest][which.reshape(-1)]
     return None
 
 
