@@ -47,7 +47,7 @@ from mivol.scene.render_tasks import (
 )
 from mivol.scene.scene_state import SceneState, find_gradient_array
 from mivol.scene.sensors import check_film, find_sensor
-from mivol.scene.stand_in import StandIn, reset_sampler
+from mivol.scene.stand_in import StandIn, evaluate_samplers, reset_sampler
 from mivol.scene.survey import SceneSurvey, survey_scene
 from mivol.scene_graph import list_values, put_value, traverse, traverse_children
 from mivol.transport.estimators.scores import Primal
@@ -269,6 +269,8 @@ class Session:
             self._surveyed = _SurveyedScene(parts, survey_scene(scene))
             self._opened, self._stand_ins = {}, {}
             self.recordings.clear()
+            if not is_recording():
+                evaluate_samplers()
         return self._surveyed
 
     def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, state: SceneState, for_images: bool) -> PlannedScene:

@@ -6,6 +6,7 @@ through another camera of the scene is such a change. So a camera of its own tak
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Sequence
@@ -64,6 +65,23 @@ def reset_sampler(sensor: mi.Sensor) -> None:
     """Seed a sampler that does not have one lane: no task reads its numbers, but recordings have inputs for them."""
     if sensor.sampler().wavefront_size() != 1:
         sensor.sampler().seed(dr.opaque(mi.UInt32, 0), 1)
+
+
+def evaluate_samplers() -> None:
+    """Evaluate the numbers of all cameras' samplers in memory, one camera at a time. Call it before a new scene is recorded.
+
+    The ``render`` of a stock integrator leaves these numbers unevaluated, as outputs of the whole rendering loop. A recording
+    evaluates the arrays of all cameras in one kernel. Two loops in one kernel end the process inside Dr.Jit 1.5 if one of them
+    was traced while there was one shape, and the other for several (:mod:`mivol.kernel_recording` says why).
+    """
+    for number in itertools.count(1):
+        try:
+            sensor = dr.reinterpret_array(mi.SensorPtr, mi.UInt32(number))[0]
+        except RuntimeError:  # after the last camera
+            return
+        if sensor is not None:
+            sensor.sampler().schedule_state()
+            dr.eval()
 
 
 def _has_no_image(film: mi.Film) -> bool:

@@ -309,6 +309,34 @@ def test_a_collection_between_traces_of_another_integrator_ends_well() -> None:
     assert done.stdout.startswith("[")
 
 
+KEPT_SCENES = """
+import mivol, numpy as np, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+
+def load(shape, **parts):
+    film = {"type": "hdrfilm", "width": 8, "height": 6, "rfilter": {"type": "box"}}
+    view = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    camera = {"type": "perspective", "to_world": view, "film": film}
+    return mi.load_dict({"type": "scene", "camera": camera, "sky": {"type": "constant"}, "shape": {"type": shape, **parts}})
+
+kept, direct = [], mi.load_dict({"type": "direct"})
+for _ in range(3):
+    kept.append(load("sphere"))
+    np.array(direct.render(kept[-1], kept[-1].sensors()[0], spp=4))
+fog = {"type": "homogeneous", "albedo": 0.5, "sigma_t": 1.0}
+scene = load("cube", bsdf={"type": "null"}, interior=fog)
+print(np.array(mi.render(scene, integrator=mi.load_dict({"type": "mivol"}), spp=4)).shape)
+"""
+
+
+def test_scenes_that_a_stock_integrator_rendered_stay_in_memory() -> None:
+    """``render`` of ``direct`` leaves the numbers of three samplers unevaluated, the first traced with one shape. When
+    the first recording of mivol evaluated them in one kernel, Dr.Jit aborted the process ("invalid redefinition ...")."""
+    done = subprocess.run([sys.executable, "-c", KEPT_SCENES], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr[-600:]
+    assert done.stdout == "(6, 8, 3)\n"
+
+
 # -- Parameters ----------------------------------------------------------------------------------------------------------------
 
 
