@@ -165,7 +165,7 @@ def settings_in(kind: type, prefix: str = "") -> list[Setting]:
 
 
 def describe(kind: type) -> list[str]:
-    """Return one line per setting with key, default, unit and meaning, for ``mivol optimize --help``."""
+    """Return one line per setting with key, default, unit and meaning, for ``mivol optimize --settings``."""
     lines = []
     for key, default, unit, meaning, choices, table in settings_in(kind):
         if not table or choices:

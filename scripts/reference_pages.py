@@ -153,16 +153,18 @@ def setting_rows(kind: type) -> list[tuple[str, str, str, str]]:
 
 
 SETTINGS_HEAD = """\
-`mivol optimize fit.toml` reads one of three kinds of file, told apart by a table that only one of them has. A setting without a
-default has to be given; what is bold is a table. Paths are relative to the file. `--set parameter.0.lr=0.2` on the command line
-overrides the file; entries of lists are counted from 0. `key[name].setting` belongs to the choice `name` only, which the file
-writes as `key = { name = "..." }` (views: `rig`; references, data: `source`; beams: `beam`). An unknown key is
-an error that offers the nearest one.
+`mivol optimize fit.toml` reads one of seven kinds of file. The tables in the headings below tell the kinds apart. Bold rows are
+tables; other rows are settings, and a setting without a default is required. Paths are relative to the file.
+
+`--set parameter.0.lr=0.2` on the command line overrides the file; the first entry of a list has the number 0.
+`optimizer[adam].beta_1` exists for `optimizer = { name = "adam" }` only. The key for the choice is `name`, but `rig` for views,
+`source` for references and data, and `beam` for scans. An unknown key is an error, whose message names the most similar key.
+`mivol optimize --settings` prints this list.
 """
 
 
 def toml_page() -> str:
-    """All settings of the three kinds of experiment."""
+    """All settings of the kinds of experiment."""
     from mivol import config
 
     kinds = {

@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 import mivol
 from mivol.cli.flags import (
     convert_flags,
-    describe_settings,
     explain_flags,
     export_flags,
     flag,
@@ -147,12 +146,10 @@ class Verb(NamedTuple):
     Attributes:
         run: function of the parsed flags; the docstring is the help, and the result is the exit code, or None (code 0).
         flags: function returning the flags; imports are delayed until the parser is made.
-        epilog: function returning the last part of the help.
     """
 
     run: Callable[[argparse.Namespace], int | None]
     flags: Callable[[], list[tuple[tuple[str, ...], dict[str, Any]]]] = list
-    epilog: Callable[[], str] = str
 
     @property
     def description(self) -> str:
@@ -166,10 +163,9 @@ class Verb(NamedTuple):
         return self.description.partition("\n")[0]
 
     def add_flags(self, sub: argparse.ArgumentParser) -> None:
-        """Add the flags and the epilog to the parser of the verb."""
+        """Add the flags to the parser of the verb."""
         for names, options in self.flags():
             sub.add_argument(*names, **options)
-        sub.epilog = self.epilog().replace("%", "%%")
 
 
 # -- Verbs -----------------------------------------------------------------------------------------------------------------
@@ -271,8 +267,8 @@ def reference(arguments: argparse.Namespace) -> None:
 def poses(arguments: argparse.Namespace) -> None:
     """Find the poses of a folder of photographs or of a video, and write them to FOLDER/sparse/0 for mivol optimize.
 
-    COLMAP searches (pip install "mivol[poses]"); nothing is downloaded, and no GPU is needed. From a video, poses takes sharp
-    frames, with parallax between them, into a folder of the video's name. The same command continues after Ctrl-C.
+    COLMAP finds the poses (pip install "mivol[poses]"); nothing is downloaded, and no GPU is needed. From a video, mivol first
+    copies sharp frames with parallax into a folder with the name of the video. The same command continues after Ctrl-C.
     """
     from mivol.photos import video
     from mivol.photos.poses import check_colmap, find_poses
@@ -299,7 +295,8 @@ def optimize(arguments: argparse.Namespace) -> None:
     """Fit a volume, scene parameters, a radiance field or Gaussians to images, projections or photographs.
 
     The projections of a scan need no TOML file: an HDF5 file (NXtomo, Data Exchange), an .xtekct file, or a folder of TIFF
-    files. optimize says what was found, assumed and chosen. All results are written into the run folder.
+    files. mivol prints what it found, assumed and chose. All results are written into the run folder. --settings prints the
+    settings of TOML files.
     """
     from mivol import config
     from mivol.cli.cluster import distribute_fit
@@ -382,7 +379,7 @@ def export(arguments: argparse.Namespace) -> None:
 
 
 def view(arguments: argparse.Namespace) -> None:
-    """Look at a run, a model, photographs, a volume or a scene in a browser, until Ctrl-C.
+    """Show a run, a model, photographs, a volume or a scene in a browser, until you press Ctrl-C.
 
     The page (pip install "mivol[viewer]") is for this machine only: the address has a token, and another host is turned away.
     Drag to turn, scroll to come closer, W A S D Q E to fly, click a camera to look from there. A run may still be fitting.
@@ -426,7 +423,10 @@ def fetch(arguments: argparse.Namespace) -> None:
 
 
 def bench(arguments: argparse.Namespace) -> int:
-    """Run a study of speed or accuracy beside other programs; write JSON and a figure, and check limits."""
+    """Run a study of speed or accuracy beside other programs, write JSON and a figure, and check the results against limits.
+
+    A study has more flags of its own: --only, --out, --variant, ... (mivol bench STUDY --help).
+    """
     from mivol.bench.harness.catalogue import list_studies, run_study
 
     if not arguments.study:
@@ -463,7 +463,7 @@ VERBS: dict[str, Verb] = {
             flag("--fps", type=float, help="most frames per second of a video (default: 2, and at most 300 in all)"),
         ],
     ),
-    "optimize": Verb(optimize, optimize_flags, describe_settings),
+    "optimize": Verb(optimize, optimize_flags),
     "sweep": Verb(sweep, sweep_flags),
     "validate": Verb(validate, validate_flags),
     "view": Verb(view, view_flags),
@@ -486,7 +486,6 @@ VERBS: dict[str, Verb] = {
             flag("--quick", action="store_true", help="run small work that tests the study; its times mean nothing"),
             flag("--compare", type=Path, metavar="old.json", help="print the changes since an earlier result"),
         ],
-        lambda: "A study has more flags of its own (mivol bench STUDY --help): --only, --out, --variant, ...",
     ),
     "doctor": Verb(doctor),
 }

@@ -6,6 +6,7 @@ import the table inside their function, so that only the parser pays for the imp
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,7 @@ def explain_flags() -> list:
             "scan (HDF5, .xtekct, folder), or photographs (folder, file)",
             "source",
         ),
-        flag("-o", "--output", type=Path, help="image (.png, .svg) of the cameras of photographs, and of the boxes"),
+        flag("-o", "--output", type=Path, help="image to write (.png, .svg): the cameras of photographs, and the boxes"),
         *model_flags("explain the fit of this model by mivol optimize"),
         list_flag("--set", "key=value", "override a setting of the experiment"),
         DATASET,
@@ -76,7 +77,8 @@ def explain_flags() -> list:
         MAX_DEPTH,
         flag(
             "--noise", type=float, default=0.02,
-            help="noise of a pixel over the mean radiance; the proposed max_depth neglects less (default: %(default)s)",
+            help="accepted noise of a pixel over its mean radiance; the proposed max_depth leaves out less light than this "
+            "(default: %(default)s)",
         ),
     ]  # fmt: skip
 
@@ -91,14 +93,14 @@ def render_flags() -> list:
         ),
         flag(
             "--look-at", type=float, nargs=6, metavar=("x", "y", "z", "to_x", "to_y", "to_z"),
-            help="for a field, points or a volume: positions of camera and target [length] (default: the view that a fit keeps "
-            "in its file, or a view of everything)",
+            help="for a field, points or a volume: positions of camera and target [length] (default: the view in the file of "
+            "a fit, or a view of everything)",
         ),
         flag("--up", type=float, nargs=3, metavar=("x", "y", "z"),
              help="upward direction of that camera (default: up in the photographs of a fit, else 0 0 1)"),
-        flag("--fov", type=float, help="horizontal field of view of that camera [degree] (default: of the kept view, or 50)"),
+        flag("--fov", type=float, help="horizontal field of view of that camera [degree] (default: as in the file, or 50)"),
         flag("--size", type=int, nargs=2, metavar=("width", "height"),
-             help="image size of that camera [pixel] (default: proportions of the kept view, or 640 480)"),
+             help="image size of that camera [pixel] (default: proportions of the view in the file, or 640 480)"),
         flag("--points", choices=DRAWN_AS, default=DRAWN_AS[0], help="shape of drawn points (default: %(default)s)"),
         flag("--radius", type=float,
              help="radius of discs, or standard deviation of splats [length] (default: half the median distance of points)"),
@@ -142,7 +144,9 @@ def optimize_flags() -> list:
         flag("-o", "--output", type=Path, help="run folder (default: the experiment's output)"),
         flag("--resume", action="store_true", help="continue from the checkpoint in the run folder"),
         CLUSTER,
-    ]
+        flag("--settings", action=PrintSettings, nargs="?", default=argparse.SUPPRESS, metavar="WORD",
+             help="print the settings of TOML files, all or those with this word in the name, and end"),
+    ]  # fmt: skip
 
 
 def sweep_flags() -> list:
@@ -156,15 +160,28 @@ def sweep_flags() -> list:
     ]
 
 
-def describe_settings() -> str:
-    """All settings of a TOML file, by kind of experiment."""
+class PrintSettings(argparse.Action):
+    """The flag ``--settings``: print settings and end the process, as ``--help`` does."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: object, values: Any, option: str | None = None) -> None:
+        lines = list_settings(values or "")
+        if not lines:
+            parser.error(f"found no setting with {values} in its name: --settings without a word prints all.")
+        print("\n".join(lines))
+        parser.exit()
+
+
+def list_settings(word: str) -> list[str]:
+    """Return the settings with a word in the name, a line each, below the kind of experiment that takes them."""
     from mivol import config
     from mivol.schema import describe
 
-    lines = ["Settings of the TOML file, by kind of experiment."]
+    lines = []
     for kind in config.EXPERIMENTS:
-        lines += ["", f"{kind.__doc__}".replace("``", "").rstrip(".") + ":", *describe(kind)]
-    return "\n  ".join(lines)
+        # A setting begins a line; its name ends at the first blank or colon.
+        if chosen := [line for line in describe(kind) if word in line.split(" ", 1)[0].rstrip(":")]:
+            lines += [f"{kind.__doc__}".replace("``", "").rstrip(".") + ":", *(f"  {line}" for line in chosen)]
+    return lines
 
 
 def validate_flags() -> list:
@@ -214,7 +231,7 @@ def convert_flags() -> list:
         SHAPE,
         DTYPE,
         flag("--to", choices=(*KINDS, "field", "mesh", "octree", "grid", "nested", "hash", "nerf"),
-             help="kind of the output (default: as the source, if possible)"),
+             help="kind of the output (default: the kind of the source, if possible)"),
         flag("--resolution", type=int,
              help="for a grid or a mesh: voxels along the longest edge (default: 128; 64 in each box of a nested grid); for "
              "Gaussians from a field: Gaussians "

@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 
 def explain(arguments: argparse.Namespace) -> int:
-    """Say what mivol would do with a scene or an experiment, and why, before it renders more than a small preview.
+    """Say what mivol would do with a scene or an experiment, and why; only a small preview is rendered.
 
     For photographs, explain lists present and missing data, and draws the cameras with --output. For points and
-    Gaussians, it prints their number, extent, sizes and opacities; for a volume or a field, its size, values and place. The
-    folder of a DICOM series is a volume; so is a folder of TIFF files without flats, darks and angles, unless --set makes it
-    a scan. A refusal comes after the facts, with exit code 1.
+    Gaussians, it prints their number, extent, sizes and opacities; for a volume or a field, its size, values and place. A
+    folder with a DICOM series counts as a volume. A folder of TIFF files without flat and dark images and angles does too,
+    unless --set makes it a scan. If mivol refuses the input, explain prints the reason after the facts, and the exit code is 1.
     """
     from mivol.photos import find_format
     from mivol.points.summary import is_points_file
@@ -249,11 +249,11 @@ WRITTEN_AS = {".npz": "field", ".obj": "mesh"}
 def convert(arguments: argparse.Namespace) -> None:
     """Convert points, Gaussians and radiance fields to each other, to meshes, and between file formats; volumes too.
 
-    A field (.npz) is the mivol_sh of a scene, an octree, a hash grid or a NeRF. --to grid, octree, hash or nerf makes one of
-    another field or of Gaussians (.ply); hash and nerf fit a network to views of the source. Fields become Gaussians as well.
-    These conversions print their error in dB, from views of both. A mesh (.obj, or .glb with a texture, or .ply
-    with --to mesh) is fused from depths of splatted views; convert prints the distance between mesh and splats.
-    A scene of pbrt-v4 (.pbrt) becomes Mitsuba XML (.xml) with media of mivol.
+    A field (.npz) holds a grid with spherical harmonics (mivol_sh in a scene), an octree, a hash grid or a NeRF. --to grid,
+    octree, hash or nerf makes a field from another field or from Gaussians (.ply); hash and nerf fit a network to views of the
+    source. --to gaussians makes Gaussians from a field. These conversions render views of source and result, and print the
+    error in dB. A mesh (.obj, .glb with a texture, or .ply with --to mesh) is fused from depth images of the Gaussians; convert
+    prints the distance between both. A scene of pbrt-v4 (.pbrt) becomes Mitsuba XML (.xml) with media of mivol.
     """
     if arguments.output.suffix.lower() == ".xml" and arguments.source.suffix.lower() == ".pbrt":
         print(_convert_scene(arguments))

@@ -24,7 +24,7 @@ class Photographs(Section):
 
     path: Annotated[str, setting("path", "folder or cameras: Blender, nerfstudio, instant-ngp, COLMAP, LLFF", min_length=1)]
     scale: Annotated[float, setting("1", "factor on width and height, by exact area means", gt=0, le=1)] = 1.0
-    largest: Annotated[int, setting("pixel", "longest edge of a photograph; absent: scale", ge=16)] | None = None
+    largest: Annotated[int, setting("pixel", "longest edge of a photograph; absent: photos.scale decides", ge=16)] | None = None
     background: Annotated[
         str | Vector,
         setting(
@@ -74,7 +74,7 @@ class FieldSettings(Section):
     kind: Annotated[Literal["grid"], setting("1", "a sparse grid of density and harmonics")] = "grid"
     preset: Annotated[str, setting("1", "nodes, steps, rates, priors: tiny, cpu, fine, capture or gpu", min_length=1)] = "cpu"
     longest: Annotated[int, setting("voxel", "voxels along the longest edge; absent: preset", ge=8)] | None = None
-    degree: Annotated[int, setting("1", "of the spherical harmonics; absent: preset", ge=0, le=4)] | None = None
+    degree: Annotated[int, setting("1", "degree of the spherical harmonics; absent: preset", ge=0, le=4)] | None = None
     first_degree: Annotated[int, setting("1", "degree of the first stage; absent: degree", ge=0, le=4)] | None = None
     effort: Annotated[float, setting("1", "factor on the preset's steps", gt=0)] = 1.0
     tv_density: Annotated[float, setting("photograph", "total variation of the density; absent: preset", ge=0)] | None = None
@@ -112,7 +112,7 @@ class FieldSettings(Section):
         bool | None, setting("1", "gains of each photograph, dropped if they agree; absent: preset (only capture)")
     ] = None
     poses: Annotated[bool, setting("1", "cameras move with the fit, for poses that are off by a pixel or more")] = False
-    beta: Annotated[float, setting("1", "favours rays of opacity 0 or 1; absent: preset", ge=0)] | None = None
+    beta: Annotated[float, setting("1", "weight of a prior for rays of opacity 0 or 1; absent: preset", ge=0)] | None = None
 
     def __post_init__(self) -> None:
         if self.sky == 1:
@@ -136,7 +136,10 @@ class ShowSettings(Section):
     ] = ()
     every: Annotated[int, setting("step", "steps between two points of the held-out curve", ge=1)] = 250
     judged: Annotated[int, setting("view", "held-out views in the curve, the same at each point; 0: all", ge=0)] = 4
-    metrics: Annotated[tuple[str, ...], setting("1", "of the judged views: psnr, ssim, flip", min_length=1)] = ("psnr", "ssim")
+    metrics: Annotated[tuple[str, ...], setting("1", "metrics of the judged views: psnr, ssim, flip", min_length=1)] = (
+        "psnr",
+        "ssim",
+    )
 
     def __post_init__(self) -> None:
         if self.way == "keyframes" and len(self.keyframes) < 2:
@@ -266,7 +269,7 @@ class OctreeSettings(Section):
     longest: (
         Annotated[int, setting("voxel", "voxels of the grid along its longest edge; absent: preset", ge=8, le=2048)] | None
     ) = None
-    degree: Annotated[int, setting("1", "of the spherical harmonics; absent: preset", ge=0, le=4)] | None = None
+    degree: Annotated[int, setting("1", "degree of the spherical harmonics; absent: preset", ge=0, le=4)] | None = None
     depth: (
         Annotated[int, setting("1", "levels of the octree below its root; absent: leaves of half a voxel", ge=1, le=12)] | None
     ) = None
@@ -304,7 +307,7 @@ class GaussianSettings(Section):
     ) = None
     start: Annotated[int, setting("1", "first Gaussians without known points; absent: preset", ge=4)] | None = None
     most: Annotated[int, setting("1", "Gaussians at the end of growth; absent: preset", ge=4)] | None = None
-    degree: Annotated[int, setting("1", "of the spherical harmonics; absent: preset", ge=0, le=3)] | None = None
+    degree: Annotated[int, setting("1", "degree of the spherical harmonics; absent: preset", ge=0, le=3)] | None = None
     control: Annotated[str | None, setting("1", "density control: clone_split or relocation; absent: preset")] = None
     ssim: Annotated[float, setting("1", "weight of SSIM in the loss; absent: preset", ge=0, le=1)] | None = None
     mip: Annotated[bool, setting("1", "keep the light of Gaussians smaller than a pixel, for other sizes")] = False

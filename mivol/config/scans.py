@@ -120,7 +120,7 @@ class Phase(Section, kw_only=True):
 
     delta_beta: Annotated[float, setting("1", "delta / beta of the material: decrement over absorption index", gt=0)]
     distance: Annotated[float, setting("mm", "object to detector; for a cone divided by the magnification", gt=0)]
-    energy: Annotated[float, setting("keV", "of the light", ge=1, le=1000)]
+    energy: Annotated[float, setting("keV", "energy of the photons", ge=1, le=1000)]
     pixel: Annotated[float, setting("um", "edge of a pixel at the object", gt=0)]
 
 
@@ -179,7 +179,7 @@ class Readings(Section):
         ]
         | None
     ) = None
-    saturation: Annotated[float, setting("reading", "smallest saturated reading, not used", gt=0)] = INFINITY
+    saturation: Annotated[float, setting("reading", "readings from this value on are saturated and not used", gt=0)] = INFINITY
 
 
 FirstRow = Annotated[Literal["lowest", "highest"], setting("1", "row of the detector that the file has first")]
@@ -229,7 +229,7 @@ class Stack(Readings, kw_only=True, tag_field="source", tag="stack"):
     dataset: Annotated[str, setting("1", "name of the array in an .npz or HDF5 file")] = ""
     flats: Annotated[str, setting("path", "readings of light without object, as file")] = ""
     darks: Annotated[str, setting("path", "readings without light, as file; empty: 0")] = ""
-    light: Annotated[float, setting("reading", "of a pixel without object, in place of flats; 0: flats, or none", ge=0)] = 0.0
+    light: Annotated[float, setting("reading", "reading without the object, in place of flats; 0: flats, or none", ge=0)] = 0.0
     angles: Annotated[str, setting("path", "text with one angle per view, or DICOM views; empty: evenly over scan.arc")] = ""
     angle_unit: Annotated[Literal["degree", "radian"], setting("1", "unit of the angles in the file")] = "degree"
     first_row: FirstRow = "lowest"
@@ -265,7 +265,7 @@ class Grid(Section):
 class SolveSettings(Section):
     """Inversion of the projections."""
 
-    name: Annotated[str, setting("1", "auto, or a key of mivol.optim.projections.inversion.ALL_SOLVERS", min_length=1)] = AUTO
+    name: Annotated[str, setting("1", "solver: auto, pcg, cgls, sirt, sart, os-sart, ml-tr, fbp or fdk", min_length=1)] = AUTO
     start: Annotated[
         Literal["empty", "filtered"] | None,
         setting("1", "first volume; absent: auto takes filtered if the views allow it, others empty"),
@@ -276,9 +276,9 @@ class SolveSettings(Section):
     ) = None
     nonnegative: Annotated[bool, setting("1", "keep every voxel at or above 0")] = True
     subsets: Annotated[int, setting("1", "subsets of views, for os-sart", ge=1)] = 10
-    relaxation: Annotated[float, setting("1", "of the first sweep of sart and os-sart", gt=0, lt=2)] = 1.0
+    relaxation: Annotated[float, setting("1", "relaxation of the first sweep of sart and os-sart", gt=0, lt=2)] = 1.0
     decay: Annotated[float, setting("1", "factor on the relaxation per sweep", gt=0, le=1)] = 0.99
-    window: Annotated[str, setting("1", "window of fbp and fdk: key of mivol.tomography.filtered.WINDOWS", min_length=1)] = (
+    window: Annotated[str, setting("1", "window of fbp and fdk: ram-lak, shepp-logan, cosine, hamming, hann", min_length=1)] = (
         "ram-lak"
     )
     cutoff: Annotated[float, setting("1", "end of the window, over the Nyquist frequency", gt=0, le=1)] = 1.0
@@ -305,7 +305,7 @@ class SolveSettings(Section):
         ),
     ] = "auto"
     memory: Annotated[float, setting("GiB", "most memory of stored rows", gt=0)] = 1.0
-    discrepancy: Annotated[float, setting("1", "stop at this residual over that of the noise; 0: never", ge=0)] = 0.0
+    discrepancy: Annotated[float, setting("1", "stop when the residual is this multiple of the noise; 0: never", ge=0)] = 0.0
 
     def __post_init__(self) -> None:
         check_word(self.name, [AUTO, *ALL_SOLVERS], "solver")

@@ -40,7 +40,7 @@ class Truth(Section):
 
     key: Annotated[str, setting("1", "key of mi.traverse(scene)", min_length=1)]
     file: Annotated[str, setting("path", "volume file; empty: procedural")] = ""
-    procedural: Annotated[str, setting("1", "key of mivol.fields.procedural.PROCEDURAL; empty: file")] = ""
+    procedural: Annotated[str, setting("1", "name of a procedural volume: tangle; empty: truth.file")] = ""
     shape: Annotated[Size, setting("voxel", "(Z, Y, X) of a procedural volume")] = (48, 48, 48)
     seed: Annotated[int, setting("1", "seed of a procedural volume", ge=0)] = 0
     peak: Annotated[float, setting("unit of the field", "largest value of a procedural volume", gt=0)] = 1.0
@@ -80,12 +80,12 @@ class Sought(Section):
     domain: Annotated[
         tuple[float, float] | None, setting("unit", "smallest and largest value; absent: those that make sense for the key")
     ] = None
-    map: Annotated[str, setting("1", "map from the optimizer's numbers: key of MAPS")] = "identity"
+    map: Annotated[str, setting("1", "map from the optimizer's numbers: identity, softplus, log or logistic")] = "identity"
     lr: Annotated[float, setting("unit", "learning rate: typical change per step", gt=0)] = 0.1
     start: Annotated[
         float | tuple[float, ...] | None, setting("unit", "first value: one number, or one per channel; absent: the scene's")
     ] = None
-    start_file: Annotated[str, setting("path", "volume with the first value; empty: start")] = ""
+    start_file: Annotated[str, setting("path", "volume with the first value; empty: parameter.start")] = ""
     start_fit: Annotated[
         Literal["", "emission"], setting("1", "emission: fit an emissive volume first, and give the first value its shape")
     ] = ""
@@ -101,12 +101,16 @@ class SceneFitSettings(Section):
 
     iterations: Annotated[int, setting("iteration", "largest number of iterations", ge=1)] = 100
     spp: Annotated[int, setting("sample/pixel", "samples of an image and of its derivative", ge=1)] = 16
-    spp_shown: Annotated[int, setting("sample/pixel", "of report images, 16 or more for z-images; 0: spp", ge=0)] = 0
+    spp_shown: Annotated[
+        int, setting("sample/pixel", "samples of report images, 16 or more for z-images; 0: fit.spp", ge=0)
+    ] = 0
     samples_per_pass: Annotated[int, setting("sample", "most samples in one kernel; Ctrl-C waits for it", ge=1)] = 1 << 20
     max_depth: Annotated[
         Depth | str | None, setting("1", "longest path, as in volpath; -1: unlimited; auto: measured; absent: the scene's")
     ] = None
-    noise: Annotated[float, setting("1", "noise over mean radiance; max_depth = auto neglects less", gt=0)] = 0.02
+    noise: Annotated[float, setting("1", "accepted noise over mean radiance; max_depth = auto leaves out less light", gt=0)] = (
+        0.02
+    )
     integrator: Annotated[str, setting("1", "Mitsuba integrator with derivatives", min_length=1)] = "mivol"
 
     def __post_init__(self) -> None:

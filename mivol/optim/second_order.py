@@ -173,7 +173,7 @@ class GaussNewton(Optimizer, tag="gauss_newton"):
     cites = ("hestenes_1952", "erdogan_1999")
 
     inner: Annotated[int, setting("iteration", "conjugate-gradient steps per linearisation", ge=1)] = 6
-    damping: Annotated[float, setting("1", "initial damping mu, relative to D", ge=0)] = 1e-3
+    damping: Annotated[float, setting("1", "first damping, relative to the diagonal of the curvature", ge=0)] = 1e-3
 
     def begin(self, problem: LinearizableProblem) -> OptimizerRun:
         return GaussNewtonRun(self, problem)

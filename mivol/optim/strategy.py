@@ -1,8 +1,8 @@
 """Named choices with checked settings: the common form of losses, priors, schedules, events and optimizers.
 
 Conventions. A strategy is a frozen msgspec struct. Its ``name`` is the tag for TOML files. Each setting has its unit, domain
-and meaning on one line, ``Annotated[float, setting("unit", "meaning", gt=0)]``; the checks and ``mivol optimize --help`` are
-made from these lines. Tables of strategies are plain dicts from :func:`make_table`.
+and meaning on one line, ``Annotated[float, setting("unit", "meaning", gt=0)]``. The checks and ``mivol optimize --settings``
+are made from these lines. Tables of strategies are plain dicts from :func:`make_table`.
 """
 
 from __future__ import annotations

@@ -151,7 +151,7 @@ def _setting(unit: str, meaning: str, **domain: float) -> msgspec.Meta:
 
 Pixels = Annotated[int, _setting("pixel", "image size along one side", ge=1, le=65536)]
 Count = Annotated[int, _setting("1", "number of views", ge=1, le=65536)]
-Degrees = Annotated[float, _setting("degree", "angle")]
+Degrees = Annotated[float, _setting("degree", "angle of the first camera around the object")]
 
 
 class Rig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="rig"):
@@ -230,7 +230,7 @@ class Ring(PlacedRig, frozen=True, tag="ring"):
     distance: Annotated[float, _setting("radius of the box", "camera to middle", gt=1)] = 4.0
     elevation: Annotated[float, _setting("degree", "height above the horizon", ge=-90, le=90)] = 0.0
     start: Degrees = 0.0
-    arc: Annotated[float, _setting("degree", "angle covered", gt=0, le=360)] = 360.0
+    arc: Annotated[float, _setting("degree", "angle that the cameras span around the object", gt=0, le=360)] = 360.0
     up: Literal["x", "y", "z"] = "y"
 
     def poses(self, center: np.ndarray, radius: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:

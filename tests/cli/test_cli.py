@@ -15,7 +15,7 @@ import pytest
 from tiny_experiment import PHOTOS, SCENE, refused, run, write_experiment
 
 from mivol.cli import VERBS, describe_error, load_named_scene, main, parse
-from mivol.config import ScanExperiment, SceneExperiment, Sought
+from mivol.config import EXPERIMENTS, ScanExperiment, SceneExperiment, Sought
 from mivol.errors import MivolError, MivolWarning
 from mivol.files import read_exr
 from mivol.optim.events import Checkpoint, Evaluate, UpdateOccupancy
@@ -208,10 +208,27 @@ def test_every_verb_says_what_it_does(capsys: pytest.CaptureFixture) -> None:
         with pytest.raises(SystemExit) as done:
             run(verb, "--help")
         assert done.value.code == 0
-        assert VERBS[verb].summary in capsys.readouterr().out.replace("\n", " ").replace("  ", " ")
+        said = capsys.readouterr().out
+        assert VERBS[verb].summary in said.replace("\n", " ").replace("  ", " ")
+        assert said.count("\n") <= 80  # two screens
     with pytest.raises(SystemExit) as done:
         run("bench", "representations", "--help")
     assert done.value.code == 0 and "--fox-edge" in capsys.readouterr().out
+
+
+def test_settings_are_listed_by_a_word_in_their_names(capsys: pytest.CaptureFixture) -> None:
+    """Below each kind of experiment that takes them; a word in the meaning alone ("memory") chooses nothing."""
+    with pytest.raises(SystemExit) as done:
+        run("optimize", "--settings", "beta_1")
+    heading, line = capsys.readouterr().out.splitlines()
+    assert (done.value.code, heading) == (0, "A fit of scene parameters to images: a file with a table [scene]:")
+    assert line == "  optimizer[adam].beta_1 = 0.9: memory of the gradient"
+    with pytest.raises(SystemExit) as done:
+        run("optimize", "--settings")
+    assert done.value.code == 0 and sum(line[0] != " " for line in capsys.readouterr().out.splitlines()) == len(EXPERIMENTS)
+    with pytest.raises(SystemExit) as done:
+        run("optimize", "--settings", "gradient")
+    assert done.value.code == 2 and "found no setting with gradient in its name" in capsys.readouterr().err
 
 
 def test_wrong_arguments_end_with_2(capsys: pytest.CaptureFixture) -> None:
