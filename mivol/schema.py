@@ -190,7 +190,7 @@ Depth = Annotated[int, msgspec.Meta(ge=-1)]
 
 Size = tuple[Count, Count, Count]
 Vector = tuple[float, float, float]
-Title = Annotated[str, setting("1", "heading of the report", min_length=1)]
+Title = Annotated[str, setting("1", "heading of the report; absent: the name of the file", min_length=1)]
 Variant = Annotated[str, setting("1", "Mitsuba variant", min_length=1)]
 Seed = Annotated[int, setting("1", "root of the fit's random numbers", ge=0)]
 Threads = Annotated[int, setting("thread", "threads of the CPU back end; 0: all cores", ge=0)]

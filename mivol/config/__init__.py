@@ -123,6 +123,8 @@ def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment:
         if DEEP_KEY.search(text):
             raise RecursionError
         raw = tomllib.loads(text)
+    except MivolError:
+        raise
     except FileNotFoundError:
         raise MivolError(f"found no file {path}: give the path of an experiment, a scan or photographs.") from None
     except RecursionError:
@@ -139,13 +141,13 @@ def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment:
 
     Args:
         raw: tables and settings, as in TOML.
-        name: beginning of an error message.
+        name: beginning of an error message, and the heading of the report if the settings give none.
 
     Raises:
         MivolError: as :func:`load`.
     """
     kind = _find_kind(raw, name)
-    raw = _with_capture(raw)
+    raw = {"title": Path(name).stem} | _with_capture(raw)
     check_keys(raw, kind, "", name)
     try:
         return msgspec.convert(raw, kind)

@@ -132,9 +132,18 @@ def test_wrong_files(tmp_path: Path) -> None:
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
     assert_refused("is not TOML", config.load, tmp_path / "binary.toml")
     assert_refused("is not TOML", config.load, tmp_path)
-    (tmp_path / "scene.xml").write_text('\n<scene version="3.0.0"/>')
-    with pytest.raises(MivolError, match=r"found XML, expected an experiment in TOML; name the scene in its table \[scene\]"):
-        config.load(tmp_path / "scene.xml")
+    xml = tmp_path / "scene.xml"
+    xml.write_text('\n<scene version="3.0.0"/>')
+    with pytest.raises(MivolError) as refused:
+        config.load(xml)
+    assert str(refused.value) == f"{xml}: found XML, expected an experiment in TOML; name the scene in its table [scene]."
+
+
+def test_an_experiment_without_a_title_has_the_name_of_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "warm fog.toml"
+    path.write_text('photos = {path = "photographs"}\n')
+    assert config.load(path).title == "warm fog"
+    assert config.load(path, ["title=mist"]).title == "mist"
 
 
 def test_the_schema_is_strict() -> None:
