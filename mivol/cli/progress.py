@@ -55,8 +55,9 @@ class TerminalProgress:
 
 def figures(fit: Fit, note: str = "") -> str:
     """The newest loss and errors in words, and a note."""
-    errors = [(QUANTITIES.get(name, Quantity(name)).label, f"{value:.4g}", "") for name, value in fit.latest_errors().items()]
-    return ", ".join([f"loss {fit.history[-1]['loss']:.4g}", *join_channels(errors), *filter(None, [note])])
+    errors = [(f"{value:.4g}", "", QUANTITIES.get(name, Quantity(name)).label) for name, value in fit.latest_errors().items()]
+    words = [f"{label} {numbers}" for numbers, _, label in join_channels(errors)]
+    return ", ".join([f"loss {fit.history[-1]['loss']:.4g}", *words, *filter(None, [note])])
 
 
 class Display:

@@ -187,8 +187,8 @@ class RunFolder:
             quantity = find_quantity(name, self.record.units)
             if value is not None:
                 figure = f"{value:.0f}" if float(value).is_integer() else f"{value:.4g}"
-                results.append((quantity.label, figure, quantity.symbol))
-        words = join_channels(results)
+                results.append((figure, quantity.symbol, quantity.label))
+        words = [f"{label} {figure} {symbol}".rstrip() for figure, symbol, label in join_channels(results)]
         times = ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in self.record.timings.items())
         return f"saved: {', '.join(words)}" + (f" ({times})" if times else "")
 

@@ -42,6 +42,7 @@ from mivol.report.record import (
     RunRecord,
     Table,
     find_quantity,
+    join_channels,
     read_metrics,
     read_record,
 )
@@ -176,7 +177,9 @@ def _numbers(record: RunRecord, views: Sequence[ViewRow], volumes: Sequence[Volu
         tiles.append((f"{np.mean(held_out):.1f}", "dB", f"PSNR, held-out views{spread}{judged}"))
     if seconds:
         tiles.append((*_duration(seconds).split(" "), "total time"))
-    tiles += [_result_tile(name, value, record.units) for name, value in record.results.items() if name not in leading]
+    tiles += join_channels(
+        _result_tile(name, value, record.units) for name, value in record.results.items() if name not in leading
+    )
     shapes = dict.fromkeys(volume.shape for volume in volumes)
     tiles += [(*_count(math.prod(shape)), f"voxels, {_format_shape(shape)}") for shape in shapes]
     return tiles

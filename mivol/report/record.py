@@ -105,12 +105,16 @@ def find_quantity(name: str, units: Mapping[str, str]) -> Quantity:
     return known._replace(unit=units.get(name, known.unit))
 
 
-def join_channels(numbers: Iterable[tuple[str, str, str]]) -> list[str]:
-    """Write numbers (label, figure, symbol of the unit). Channels of a parameter (``label[0]``, ``label[1]``) are one group."""
+def join_channels(numbers: Iterable[tuple[str, str, str]]) -> list[tuple[str, str, str]]:
+    """Join the figures of all channels of a parameter, whose labels are ``label[0]``, ``label[1]``.
+
+    Args:
+        numbers: figure, symbol of the unit, and label.
+    """
     groups: dict[tuple[str, str], list[str]] = {}
-    for label, figure, symbol in numbers:
-        groups.setdefault((re.sub(r"\[\d+\]$", "", label), symbol), []).append(figure)
-    return [f"{label} {' '.join(figures)} {symbol}".rstrip() for (label, symbol), figures in groups.items()]
+    for figure, symbol, label in numbers:
+        groups.setdefault((symbol, re.sub(r"\[\d+\]$", "", label)), []).append(figure)
+    return [(" ".join(figures), symbol, label) for (symbol, label), figures in groups.items()]
 
 
 class _Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):

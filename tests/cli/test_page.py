@@ -616,7 +616,8 @@ def write_run_by_hand(folder: Path) -> Path:
             config={"title": "it", "scene": {"views": 3, "spp": None, "film": {"size": [6, 4]}}, "fast": True},
             versions={"python": "3.11", "mivol": "1.2"}, seeds={"start": 7}, plan=[PlanLine(choice="this", reason="that")],
             timings={"load": 0.5, "fit": 90.25, "judge": 8.0}, images=images, volumes=volumes,
-            results={"nrmse": 0.03125, "iterations": 20.0, "memory": 1234.5, "my_number": 2.5, "lamp.x": 1.5, "ssim": None},
+            results={"nrmse": 0.03125, "iterations": 20.0, "memory": 1234.5, "my_number": 2.5, "lamp.x": 1.5, "ssim": None,
+                     "rgb[0]": 0.5, "rgb[1]": 0.75},
             units={"loss": "radiance²", "my_number": "1", "lamp.x": "length"},
             tables=[Table(title="A table", head=("what", "how"), rows=(("a", "1"), ("b", "2")))], notes=["Mind this."],
             citations=list(CITATIONS)[:2],
@@ -632,7 +633,7 @@ def test_every_part_of_a_record_is_on_the_page(tmp_path: Path) -> None:
     words = [" ".join(word.split()) for word in page.words]
     said = " | ".join(word for word in words if word)
     for part in (
-        *("Every part", "99 s on 3 cores", "0.0312", "24.9 dB", "nRMSE 0.0978", "20.8%"),
+        *("Every part", "99 s on 3 cores", "0.0312", "24.9 dB", "nRMSE 0.0978", "20.8%", "rgb | 0.5 0.75"),
         *("Radiance [W] | 0 | 2", "| -0.25 | 0.25 |", "| -4 | 4 |", "sigma_t [1/length] | 0 | 0.998"),
         *("z = 2 of 2", "y = 2 of 3", "x = 3 of 4", "The albedo", "A slice", "As it is"),
         *("A table | what | how | a | 1 | b | 2", "this | that", "Mind this."),
