@@ -30,6 +30,7 @@ from mivol.scene.readings import (
     read_lowest_albedo,
     read_number,
 )
+from mivol.scene.scene_state import is_painted
 from mivol.scene.survey import (
     OUTSIDE_SHAPES,
     Boundary,
@@ -186,9 +187,7 @@ def warn_of_clipped_view(needs: Needs, sensor: mi.Sensor, survey: SceneSurvey) -
 
 def _is_placement(key: str, owner: object) -> bool:
     """Whether a parameter places a shape or a sensor; colours painted on a mesh do not count."""
-    name = key.rsplit(".", 1)[-1]
-    painted = name.startswith(("vertex_", "face_")) and name not in ("vertex_positions", "vertex_normals", "vertex_texcoords")
-    return isinstance(owner, mi.Shape | mi.Sensor) and not painted
+    return isinstance(owner, mi.Shape | mi.Sensor) and not is_painted(key.rsplit(".", 1)[-1])
 
 
 def may_camera_be_inside(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey) -> bool:

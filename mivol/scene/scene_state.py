@@ -20,6 +20,9 @@ from mivol.transport.path.film import find_batch_views
 FOLLOWED = ("data", "value")
 """Names of the parameters of volumes and textures whose values a recording follows."""
 
+PLACES = ("position", "to_world")
+"""Names of the parameters of emitters that decide on the host what is traced."""
+
 RECORDED_BACK_ENDS = ("llvm",)
 """Back ends on which renders are recorded. On a GPU, Dr.Jit 1.5 reads the handle of a hardware texture from memory that other
 textures leave uninitialised, and aborts the process; nobody has tried recordings there."""
@@ -55,18 +58,24 @@ class SceneState:
     differentiated: list[tuple[str, mi.Object]] = field(default_factory=list)
 
     @classmethod
-    def of(cls, scene: mi.Scene, sensor: mi.Sensor, attached: list[Any] | None = None) -> SceneState:
+    def of(
+        cls, scene: mi.Scene, sensor: mi.Sensor, attached: list[Any] | None = None, before: SceneState | None = None
+    ) -> SceneState:
         """Read the state of a scene and of the sensor to render, which may lie outside of the scene.
 
+        A value that Dr.Jit knows as a number, and that was another one before, becomes an array in the scene: kernels hold
+        numbers, so each new number would be compiled anew.
+
         Args:
+            before: an earlier state of the scene.
             attached: list for the arrays, and the matrices of transforms, of the scene with gradients enabled. The state itself
                 holds none: it would keep the derivatives of an earlier step.
         """
         state, attached = cls(sensor), [] if attached is None else attached
-        params = traverse(scene)
-        state.differentiated = state._add(params, attached)
+        params, known = traverse(scene), [] if before is None else before.values
+        state.differentiated = state._add(params, attached, known)
         if sensor not in params.hierarchy:
-            state._add(traverse(sensor), [])
+            state._add(traverse(sensor), [], known)
         state.others.append(_describe_sensor(sensor))
         return state
 
@@ -91,8 +100,12 @@ class SceneState:
         numbers, others = ([value[:2] for value in state.values] for state in (self, other))
         return self.sensor is other.sensor and numbers == others and self.others == other.others
 
-    def _add(self, params: mi.SceneParameters, attached: list[Any]) -> list[tuple[str, mi.Object]]:
-        """Add parameters; returns the keys with gradients enabled, and their owners, and appends their arrays."""
+    def _add(self, params: mi.SceneParameters, attached: list[Any], before: list) -> list[tuple[str, mi.Object]]:
+        """Add parameters; returns the keys with gradients enabled, and their owners, and appends their arrays.
+
+        Args:
+            before: ``values`` of an earlier state.
+        """
         differentiated = []
         for key in params.properties:
             value, owner = read_value(params, key), params.properties[key][2]
@@ -100,10 +113,16 @@ class SceneState:
             if numbers is None or not dr.is_jit_v(numbers):
                 self._sort(owner, False, value if isinstance(value, int | float | str | bool) else str(value))
                 continue
-            kept = dr.detach(numbers)
+            is_followed, kept = _is_followed(owner, key), dr.detach(numbers)
+            indices = tuple(dr.detail.collect_indices(kept))
+            known = before[len(self.values)][0] if is_followed and len(self.values) < len(before) else indices
+            if indices != known and kept.state == dr.VarState.Literal:
+                dr.make_opaque(numbers)
+                kept = dr.detach(numbers)
+                indices = tuple(dr.detail.collect_indices(kept))
             self.held.append(kept)
-            state = (tuple(dr.detail.collect_indices(kept)), dr.shape(kept), dr.grad_enabled(numbers))
-            self._sort(owner, _is_followed(owner, key), state)
+            state = (indices, dr.shape(kept), dr.grad_enabled(numbers))
+            self._sort(owner, is_followed, state)
             if state[2]:
                 differentiated.append((key, owner))
                 attached.append(numbers)
@@ -157,9 +176,19 @@ def _is_followed(owner: mi.Object, key: str) -> bool:
     if owner.class_name() == "HGPhaseFunction":
         # Of a medium: its ``g`` is an input. A lobe of a mixture is called through its pointer, where ``g`` is hidden.
         return key.endswith("phase_function.g")
+    name = key.rpartition(".")[2]
     if isinstance(owner, mi.Volume | mi.Texture):
-        return key.rpartition(".")[2] in FOLLOWED
+        return name in FOLLOWED
+    if isinstance(owner, mi.BSDF | mi.Emitter):
+        return name not in PLACES
+    if isinstance(owner, mi.Shape):
+        return is_painted(name)
     return isinstance(owner, mi.Sensor) and owner.class_name() in ARRAYS
+
+
+def is_painted(name: str) -> bool:
+    """Whether a parameter of a mesh is an attribute of its vertices or faces, such as a colour, and does not place the mesh."""
+    return name.startswith(("vertex_", "face_")) and name not in ("vertex_positions", "vertex_normals", "vertex_texcoords")
 
 
 def _is_of_mivol(node: mi.Object) -> bool:

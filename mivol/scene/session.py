@@ -134,7 +134,7 @@ class Session:
             raise MivolError("found develop=False, expected True: mivol returns only developed images.")
         sensor = _find_renderable_sensor(scene, sensor)
         with without_garbage_collection(), dr.suspend_grad():
-            opened = self._open(scene, sensor, spp, SceneState.of(scene, sensor), for_images=True)
+            opened = self._open(scene, sensor, spp, self._read_state(scene, sensor, True), for_images=True)
             image = self._run(ImageTask, opened, scene, sensor, _opaque_seed(seed))
         if evaluate:
             dr.eval(image)
@@ -145,7 +145,7 @@ class Session:
         sensor = _find_renderable_sensor(scene, sensor)
         with without_garbage_collection(), carry_tangents(scene):
             with dr.resume_grad():
-                opened = self._open(scene, sensor, spp, SceneState.of(scene, sensor), for_images=False)
+                opened = self._open(scene, sensor, spp, self._read_state(scene, sensor, False), for_images=False)
             return self._run(TangentTask, opened, scene, sensor, _opaque_seed(seed))
 
     def render_backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: int | mi.Sensor, seed: int, spp: int) -> None:
@@ -157,11 +157,11 @@ class Session:
         with without_garbage_collection():
             with dr.resume_grad():
                 attached: list[Any] = []
-                state = SceneState.of(scene, sensor, attached)
+                state = self._read_state(scene, sensor, False, attached)
                 if self._survey(scene, state).derives_from(scene, state.differentiated):
                     recompute_derived(scene)
                     attached = []
-                    state = SceneState.of(scene, sensor, attached)
+                    state = self._read_state(scene, sensor, False, attached)
                 opened = self._open(scene, sensor, spp, state, for_images=False)
             self._run(GradientTask, opened, scene, sensor, _opaque_seed(seed), grad_in, attached=attached)
 
@@ -169,7 +169,7 @@ class Session:
         """Estimate the radiance along given rays, for integrators that nest this integrator and do not name a sensor."""
         with dr.suspend_grad():
             sensor = find_sensor(scene, 0)
-            opened = self._open(scene, sensor, 1, SceneState.of(scene, sensor), for_images=True)
+            opened = self._open(scene, sensor, 1, self._read_state(scene, sensor, True), for_images=True)
             task = RenderTask(opened, self.settings, self.aovs, for_images=True)
             estimators = task.build_estimators(scene, opened.read_arrays())
             media = estimators.media
@@ -229,6 +229,13 @@ class Session:
             f"a render of {width} x {height} pixels ran out of memory on {where}: render crops of half the pixels, or give"
             " the grids 80 % of their nodes along each axis (half the memory)."
         )
+
+    def _read_state(
+        self, scene: mi.Scene, sensor: mi.Sensor, for_images: bool, attached: list[Any] | None = None
+    ) -> SceneState:
+        """Read the state of the parameters (:meth:`SceneState.of`)."""
+        known = self._opened.get(for_images)
+        return SceneState.of(scene, sensor, attached, None if known is None else known.state)
 
     def _find_stand_in(self, sensor: mi.Sensor, state: SceneState) -> StandIn | None:
         """The camera to render in the place of a sensor; None for the sensor itself."""

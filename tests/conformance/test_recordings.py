@@ -63,6 +63,29 @@ def fire() -> mi.Scene:
     return close_up({"smoke": box_of(smoke | {"emission_density": light}, PLACE)}, res=6)
 
 
+def lit_by_maps() -> mi.Scene:
+    """Under an environment map and a spot."""
+    colours = np.random.default_rng(1).uniform(0.1, 1.0, (8, 16, 3)).astype(np.float32)
+    above = mi.ScalarTransform4f().look_at([2, -2, 3], [0, 0, 0], [0, 0, 1])
+    spot = {"type": "spot", "to_world": above, "intensity": 20.0, "cutoff_angle": 14.0, "beam_width": 7.0}
+    return smoke_under(sky={"type": "envmap", "bitmap": mi.Bitmap(colours)}, spot=spot)
+
+
+def before_painted_faces() -> mi.Scene:
+    """Before a square with colours at its vertices, beside a rough ball."""
+    material = mi.Properties()
+    reflectance = {"type": "mesh_attribute", "name": "vertex_color"}
+    material["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": reflectance})
+    square = mi.Mesh("square", 4, 2, props=material)
+    square.add_attribute("vertex_color", 3, [0.5, 0.2, 0.3, 0.3, 0.5, 0.9] * 2)
+    params = mi.traverse(square)
+    params["vertex_positions"] = mi.Float([-2, 1.5, -2, 2, 1.5, -2, 2, 1.5, 2, -2, 1.5, 2])
+    params["faces"] = mi.UInt32([0, 1, 2, 0, 2, 3])
+    params.update()
+    ball = {"type": "sphere", "center": [0.3, -0.9, -0.2], "radius": 0.7, "bsdf": {"type": "roughplastic", "alpha": 0.3}}
+    return smoke_under(sky=sky(0.7), ball=ball, wall=square)
+
+
 SCENES: dict[str, tuple[Callable[[], mi.Scene], int, list[str]]] = {
     "grid": (smoke_under, 4, [INSIDE + "sigma_t.data", INSIDE + "albedo.value.value", "sky.radiance.value"]),
     "one scattering": (lambda: smoke_under(sun=sun([0.3, 0.2, -1.0])[0]), 2, [INSIDE + "sigma_t.data", "sun.irradiance.value"]),
@@ -74,6 +97,8 @@ SCENES: dict[str, tuple[Callable[[], mi.Scene], int, list[str]]] = {
         [INSIDE + key for key in ("phase_function.g", "sigma_t.data")],
     ),
     "lamp": (lamp_in_fog, 5, [INSIDE + "sigma_t.value.value", "floor.bsdf.reflectance.value"]),
+    "maps": (lit_by_maps, 3, ["sky.data", "sky.scale", "spot.beam_width"]),
+    "surfaces": (before_painted_faces, 3, ["wall.vertex_color", "ball.bsdf.alpha"]),
     "fire": (fire, 3, [INSIDE + "emission_density.data", INSIDE + "sigma_t.data"]),
 }
 
@@ -120,16 +145,17 @@ class Pair:
         self.params.update()
 
     def gradient(self, integrator: mi.Integrator, key: str, seed: int) -> np.ndarray:
-        with self.differentiated(key):
+        with self.differentiated(key) as value:
             dr.backward(dr.mean(mi.render(self.scene, self.params, integrator=integrator, seed=seed, spp=2), axis=None))
-            return np.array(dr.ravel(dr.grad(self.params[key])))
+            return np.array(dr.ravel(dr.grad(value)))
 
     def tangents(self, key: str, seed: int) -> list[np.ndarray]:
         return [self.tangent(integrator, key, seed) for integrator in (self.recorded, self.traced)]
 
     def tangent(self, integrator: mi.Integrator, key: str, seed: int) -> np.ndarray:
         with self.differentiated(key) as value:
-            dr.set_grad(value, 0.1 * (seed + 1) + value)
+            # A map copies what it is given.
+            dr.set_grad(self.params[key], 0.1 * (seed + 1) + value)
             return np.array(integrator.render_forward(self.scene, self.params, seed=seed, spp=2))
 
     def assert_same(self, seed: int, **more: object) -> None:
@@ -137,7 +163,7 @@ class Pair:
         assert np.array_equal(found, truth) and truth.max() > 0
 
 
-@pytest.mark.parametrize("name", cases(SCENES, slow=("stock grid", "phase", "fire")))
+@pytest.mark.parametrize("name", cases(SCENES, slow=("stock grid", "phase", "surfaces", "fire")))
 def test_images_follow_values(name: str) -> None:
     """To the last bit, and after the first calls without another recording."""
     make, depth, keys = SCENES[name]
@@ -169,7 +195,7 @@ def assert_same_derivatives(name: str, find: Callable[[Pair, str, int], list[np.
     return pair
 
 
-@pytest.mark.parametrize("name", cases(SCENES, slow=("stock grid", "phase", "fire", "one scattering")))
+@pytest.mark.parametrize("name", cases(SCENES, slow=("stock grid", "phase", "surfaces", "fire", "one scattering")))
 def test_gradients_follow_values(name: str) -> None:
     assert_same_derivatives(name, Pair.gradients)
 
@@ -178,7 +204,24 @@ def test_gradients_follow_values(name: str) -> None:
 def test_tangents_follow_values(name: str) -> None:
     pair = assert_same_derivatives(name, Pair.tangents)
     # The ``g`` of a stock ``hg`` is recorded anew in each step. Two recordings join the arrays of the scene and its tracer.
-    assert pair.recordings.count <= 2 * len(SCENES[name][2]) + {"stock phase": 1, "lamp": 2}.get(name, 0)
+    assert pair.recordings.count <= 2 * len(SCENES[name][2]) + {"stock phase": 1, "lamp": 2, "surfaces": 2}.get(name, 0)
+
+
+@pytest.mark.parametrize(
+    ("make", "key"),
+    [(lit_by_maps, "sky.scale"), (SCENES["stock phase"][0], INSIDE + "phase_function.g")],
+    ids=["sky", "phase"],
+)
+def test_a_number_that_changes_becomes_an_array(make: Callable, key: str) -> None:
+    """A number would be compiled into the kernels of each step."""
+    pair, counts = Pair(make(), 3), []
+    for call in range(4):
+        pair.params[key] = mi.Float(0.5 + 0.1 * call)
+        pair.params.update()
+        assert pair.params[key].state == dr.VarState.Literal
+        pair.gradient(pair.recorded, key, call)
+        counts.append(pair.recordings.count)
+    assert counts[1] == counts[-1]
 
 
 def test_a_gradient_flows_on_to_what_a_parameter_was_made_from() -> None:
