@@ -82,6 +82,7 @@ def write_transforms(folder: Path, settings: dict, size: tuple[int, int] = (12, 
 
 MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV")
 MODEL_IDS = {model: number for number, model in enumerate((*MODELS, "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"))}
+MODEL_IDS |= {"SIMPLE_FISHEYE": 14, "FISHEYE": 15, "EQUIRECTANGULAR": 17}
 
 COLMAP_CAMERAS = {
     "SIMPLE_PINHOLE": (50.0, 31.0, 22.0),

@@ -73,6 +73,11 @@ def intrinsics(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
+def panorama_intrinsics(size: tuple[float, float]) -> np.ndarray:
+    """Return K (3, 3) of a panorama of (width, height) pixels, in pixels per radian."""
+    return intrinsics(size[0] / (2 * np.pi), size[1] / np.pi, size[0] / 2, size[1] / 2)
+
+
 def pixel_centres(size: tuple[int, int]) -> np.ndarray:
     """Return the centres (height, width, 2) of the pixels of an image of (width, height) pixels."""
     x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)

@@ -2,7 +2,8 @@
 
 Own parser: pycolmap takes 135 MB. COLMAP stores world to camera, x_c = R(q) x + t, with the quaternion (w, x, y, z) and
 OpenCV's axes (y down, z forward). COLMAP counts pixels from the upper left corner, as mivol does. Coefficients missing in a
-camera model are 0.
+camera model are 0. Rigs (``rigs.bin`` and ``frames.bin`` of COLMAP 3.12 and later) are not read, because the file of images has
+the pose of each image in the world.
 
 Source: the file formats in COLMAP's documentation ("Output Format") and the parameters of its camera models.
 """
@@ -18,13 +19,14 @@ from typing import Any
 import numpy as np
 
 from mivol.files.source import parse_reals, read_bytes, refusal
-from mivol.photos.camera import FLIP, Camera, intrinsics
-from mivol.photos.lens import Fisheye, Lens
+from mivol.photos.camera import FLIP, Camera, intrinsics, panorama_intrinsics
+from mivol.photos.lens import Fisheye, Lens, Panorama
 from mivol.photos.listing import SHRUNK, Entry, Listing, check_points, find_image, list_photographs, name_first
 
 MODEL_NUMBERS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
-    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION"),
+    *("DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
 )
 
 #: name -> names of the parameters, in the order of the file.
@@ -37,6 +39,9 @@ CAMERA_MODELS: dict[str, tuple[str, ...]] = {
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
     "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+    "SIMPLE_FISHEYE": ("f", "cx", "cy"),
+    "FISHEYE": ("fx", "fy", "cx", "cy"),
+    "EQUIRECTANGULAR": ("w", "h"),
 }
 
 
@@ -46,7 +51,7 @@ class Sensor:
 
     size: tuple[int, int]
     K: np.ndarray
-    lens: Lens | Fisheye
+    lens: Lens | Fisheye | Panorama
 
 
 @dataclass(frozen=True)
@@ -186,6 +191,8 @@ def _entry(folder: Path, pose: Pose, sensors: dict[int, Sensor], file: Path, poi
 
 def _sensor(path: Path, model: str, size: tuple[int, int], parameters: tuple[float, ...]) -> Sensor:
     named = dict(zip(_parameter_names(path, model), parameters, strict=True))
+    if model == "EQUIRECTANGULAR":
+        return Sensor(size, panorama_intrinsics((named["w"], named["h"])), Panorama())
     fx, fy = named.get("fx", named.get("f")), named.get("fy", named.get("f"))
     kind = Fisheye if model.endswith("FISHEYE") else Lens
     lens = kind(**{key: value for key, value in named.items() if key in kind.__dataclass_fields__})

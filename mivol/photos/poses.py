@@ -24,6 +24,7 @@ from typing import Any
 
 from mivol.errors import MivolError
 from mivol.files.source import refusal
+from mivol.photos.colmap import find_model
 from mivol.photos.listing import find_mask, list_photographs, name_first, split_numbers
 from mivol.photos.photo_file import is_damaged, read_lens_facts, read_mask, read_photo_header, write_upright
 from mivol.photos.survey import find_format
@@ -194,7 +195,8 @@ def _check_folder(folder: Path) -> tuple[Path, list[str]]:
     check_colmap()
     kind = find_format(folder)
     if kind is not None:
-        way_out = f"mivol optimize {folder}, or remove them first"
+        model = find_model(folder) or "them"
+        way_out = f"mivol optimize {folder}, or remove {model} and search again, if there are new photographs"
         raise refusal(folder, f"poses in it already ({kind})", "photographs without poses", way_out)
     images, names = list_photographs(folder)
     _check_count(folder, len(names), f"in {images}")

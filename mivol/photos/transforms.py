@@ -4,7 +4,8 @@ Conventions. ``transform_matrix`` is camera to world with the axes of :mod:`mivo
 horizontal angle [radian]. Focal lengths and principal points are in pixels from the upper left corner, as in COLMAP. The lists
 ``train_filenames``, ``val_filenames`` and ``test_filenames`` define the splits. With a training list, photographs outside all
 lists are ignored. Settings for the unit cube of another program (``aabb_scale``, ``scale``, ``offset``) are ignored as well.
-``ply_file_path`` names the points of a sparse reconstruction in the frame of the cameras.
+``ply_file_path`` names the points of a sparse reconstruction in the frame of the cameras. A file from another machine may name
+no existing photograph: then names without the leading folders that all of them share are tried, and other suffixes.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ import numpy as np
 from mivol.files.atomic import write_whole_text
 from mivol.files.ply import read_vertices, vertex_positions
 from mivol.files.source import read_bytes, refusal
-from mivol.photos.camera import Camera, intrinsics
+from mivol.photos.camera import Camera, intrinsics, panorama_intrinsics
 from mivol.photos.lens import Fisheye, Lens, Panorama
 from mivol.photos.listing import UNLISTED, Entry, Listing, check_points, find_image
 
@@ -68,7 +69,8 @@ def read_transforms(path: Path) -> Listing:
     """
     file = path / "transforms.json" if path.is_dir() else path
     table = _read_json(file)
-    return Listing(_entries(file, table, "train"), _points(file, table))
+    entries, notes = _find_elsewhere(file.parent, _entries(file, table, "train"))
+    return Listing(entries, _points(file, table), notes=notes)
 
 
 def write_transforms(path: Path, cameras: Mapping[str, Camera], test: Sequence[str] = ()) -> None:
@@ -153,6 +155,34 @@ def _read_splits(file: Path, table: Mapping[str, Any]) -> dict[str, str]:
     return splits
 
 
+def _find_elsewhere(folder: Path, entries: list[Entry]) -> tuple[list[Entry], tuple[str, ...]]:
+    """If no listed photograph exists, look for them with other suffixes, and without leading folders that all names share.
+
+    Returns:
+        The entries with the files that were found, and a note on them.
+    """
+    if any(entry.file.is_file() for entry in entries):
+        return entries, ()
+    listed = [PurePosixPath(entry.name) for entry in entries]
+    heads = [PurePosixPath(), *reversed(listed[0].parents)]
+    for left_out in (head for head in heads if all(name.is_relative_to(head) for name in listed)):
+        names = [name.relative_to(left_out) for name in listed]
+        for stems in (names, [name.with_suffix("") for name in names]):
+            files = [find_image(folder / stem) for stem in stems]
+            if file := next((file for file in files if file.is_file()), None):
+                moved = [_move_entry(folder, *found, left_out) for found in zip(entries, names, files, strict=True)]
+                return moved, (f"no photograph has its listed name; {entries[files.index(file)].name} was found as {file}",)
+    return entries, ()
+
+
+def _move_entry(folder: Path, entry: Entry, name: PurePosixPath, file: Path, left_out: PurePosixPath) -> Entry:
+    """An entry with a shorter name and the file that was found; its mask loses the same leading folders."""
+    mask = entry.mask
+    if mask is not None and mask.is_relative_to(folder / left_out):
+        mask = folder / mask.relative_to(folder / left_out)
+    return dataclasses.replace(entry, name=str(name), file=file, mask=mask)
+
+
 def _full_path(file: Path, name: str) -> str:
     """Normalised path of a photograph: ``./a.png`` and ``a.png`` are equal."""
     return os.path.normpath(file.parent.absolute() / to_forward_slashes(file.parent, name))
@@ -235,21 +265,33 @@ class Settings:
         return int(width), int(height)
 
     def intrinsics(self, size: tuple[int, int]) -> np.ndarray:
-        """Return K (3, 3). Focal lengths precede angles; the default principal point is the image centre.
+        """Return K (3, 3). ``K`` precedes focal lengths, and these precede angles; the default principal point is the centre.
 
         One focal length or angle serves both axes.
 
         Raises:
-            MivolError: neither a focal length nor an angle.
+            MivolError: no focal length, angle or ``K``, or a ``K`` that is no matrix of a camera without skew.
         """
+        if "K" in self.values:
+            return self._matrix_of_camera()
         fx = self._focal("fl_x", "camera_angle_x", size[0])
         fy = self._focal("fl_y", "camera_angle_y", size[1])
         if fx is None and fy is None:
             raise refusal(
-                self.name, "no focal length", "fl_x, fl_y, camera_angle_x or camera_angle_y", "add it to the file of cameras"
+                self.name, "no focal length", "fl_x, fl_y, camera_angle_x, camera_angle_y or K", "add it to the file of cameras"
             )
         fx, fy = fy if fx is None else fx, fx if fy is None else fy
         return intrinsics(fx, fy, self.number("cx", size[0] / 2), self.number("cy", size[1] / 2))
+
+    def _matrix_of_camera(self) -> np.ndarray:
+        try:
+            K = np.asarray(self.values["K"], np.float64)
+        except (ValueError, TypeError):
+            K = np.empty(0)
+        expected = "3 x 3 numbers fx, 0, cx; 0, fy, cy; 0, 0, 1 of a camera without skew"
+        if K.shape != (3, 3) or not np.array_equal(K, intrinsics(K[0, 0], K[1, 1], K[0, 2], K[1, 2])):
+            raise refusal(self.name, f"K = {self.values['K']!r}", expected, "correct K")
+        return K
 
     def panorama(self, size: tuple[int, int]) -> np.ndarray:
         """Return K (3, 3) of a panorama in pixels per radian; focal lengths in the file are ignored.
@@ -264,7 +306,7 @@ class Settings:
                 "an image twice as wide as high",
                 "use the uncropped image",
             )
-        return intrinsics(size[0] / (2 * np.pi), size[1] / np.pi, size[0] / 2, size[1] / 2)
+        return panorama_intrinsics(size)
 
     def _focal(self, length: str, angle: str, pixels: int) -> float | None:
         if length in self.values:

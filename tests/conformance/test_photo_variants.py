@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from mivol.cli import main
 from mivol.files import ply
 from mivol.photos import load_photos, survey_photos
+from mivol.photos.camera import intrinsics
 from mivol.photos.camera_path import HomeView
 from mivol.photos.lens import Lens
 from mivol.photos.listing import find_shrink
@@ -47,6 +48,46 @@ def test_a_folder_of_smaller_photographs_scales_the_cameras(tmp_path: Path, shri
     for frame, before in zip(survey.frames, whole, strict=True):
         assert frame.camera.size == (64 // shrink, 48 // shrink)
         np.testing.assert_allclose(frame.camera.K[:2] * shrink, before.camera.K[:2])
+
+
+@pytest.mark.parametrize("head", ["/home/ann/box/", "C:\\data\\box\\", "../../box/", ""])
+@pytest.mark.parametrize("suffix", [".png", ".JPG"])
+def test_photographs_of_another_machine_are_found(tmp_path: Path, head: str, suffix: str) -> None:
+    """The file of cameras names folders and suffixes that are elsewhere; splits and masks follow the photographs."""
+    folder = write_transforms(tmp_path / "set", {"fl_x": 20})
+    (folder / "masks").mkdir()
+    Image.fromarray(np.full((8, 12), 255, np.uint8)).save(folder / "masks" / "3.png")
+    before = [frame.camera.to_world for frame in survey_photos(folder, box=BOX).frames]
+
+    def rename(table: dict) -> None:
+        for number, frame in enumerate(table["frames"]):
+            frame["file_path"] = f"{head}images/{number:04d}{suffix}"
+        table["frames"][3]["mask_path"] = f"{head}masks/3.png"
+        table["test_filenames"] = [table["frames"][1]["file_path"]]
+
+    edit(folder / "transforms.json", rename)
+    survey = survey_photos(folder, box=BOX)
+    moved = bool(head) or suffix != ".png"
+    assert ("no photograph has its listed name" in survey.describe()) == moved
+    assert [frame.file for frame in survey.frames] == [folder / "images" / f"{number:04d}.png" for number in range(4)]
+    assert [frame.split for frame in survey.frames] == ["train", "test", "train", "train"]
+    assert [frame.mask for frame in survey.frames] == [None, None, None, folder / "masks" / "3.png"]
+    for frame, old in zip(survey.frames, before, strict=True):
+        np.testing.assert_array_equal(frame.camera.to_world, old)
+
+
+def test_a_matrix_of_the_camera_in_each_frame(tmp_path: Path) -> None:
+    folder = write_transforms(tmp_path / "set", {"K": [[20, 0, 5.5], [0, 21, 4.5], [0, 0, 1]]})
+    edit(folder / "transforms.json", lambda table: table["frames"][1].update(K=[[30, 0, 6], [0, 31, 4], [0, 0, 1.0]]))
+    frames = survey_photos(folder, box=BOX).frames
+    np.testing.assert_array_equal(frames[0].camera.K, intrinsics(20, 21, 5.5, 4.5))
+    np.testing.assert_array_equal(frames[1].camera.K, intrinsics(30, 31, 6, 4))
+
+
+@pytest.mark.parametrize("K", [[[20, 1, 6], [0, 21, 4], [0, 0, 1]], [[20, 0, 6], [0, 21, 4]], "20", [[20], [0, 1]]])
+def test_other_matrices_are_refused(tmp_path: Path, K: object) -> None:
+    folder = write_transforms(tmp_path / "set", {"K": K})
+    assert_refused("expected 3 x 3 numbers fx, 0, cx; 0, fy, cy; 0, 0, 1", survey_photos, folder)
 
 
 def test_three_rows_of_a_transform_are_enough(tmp_path: Path) -> None:

@@ -18,6 +18,8 @@ from refusals import assert_refused
 
 from mivol.cli import main
 from mivol.photos import colmap_process, poses, survey_photos
+from mivol.photos.camera import directions
+from mivol.photos.colmap import CAMERA_MODELS, read_colmap
 from mivol.photos.listing import list_photographs
 from mivol.photos.photo_file import ORIENTATION, read_lens_facts, read_photo_header
 from mivol.report import cameras
@@ -394,6 +396,43 @@ def test_half_turns_of_colmap_are_of_stored_pixels(tmp_path: Path) -> None:
     set_exif(folder / "images" / "a view 1.png", {ORIENTATION: 3})
     frames = survey_photos(folder, box=np.array([[-1.0] * 3, [1.0] * 3])).frames
     assert [frame.orientation for frame in frames] == [1] * 4
+
+
+@pytest.mark.parametrize("suffix", ["binary", "text"])
+@pytest.mark.parametrize("model", CAMERA_MODELS)
+def test_rigs_of_pycolmap(tmp_path: Path, model: str, suffix: str) -> None:
+    """Each pixel of two cameras of a rig has the ray that pycolmap gives it, which composes the poses of frame and rig.
+
+    pycolmap's search for a ray ends at steps of 1e-10.
+    """
+    pycolmap = pytest.importorskip("pycolmap")
+    camera = pycolmap.Camera.create_from_model_id(1, getattr(pycolmap.CameraModelId, model), 40.0, 64, 48)
+    terms = zip(CAMERA_MODELS[model], camera.params, strict=True)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1,
+        num_cameras_per_rig=2,
+        num_frames_per_rig=2,
+        num_points3D=10,
+        camera_width=64,
+        camera_height=48,
+        camera_model_id=camera.model,
+        camera_params=[0.01 if name[0] in "kp" else value for name, value in terms],
+        sensor_from_rig_translation_stddev=0.5,
+        sensor_from_rig_rotation_stddev=20.0,
+    )
+    made = pycolmap.synthesize_dataset(options)
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    getattr(made, f"write_{suffix}")(tmp_path / "sparse" / "0")
+    listing = read_colmap(tmp_path)
+    images = {image.name: image for image in made.images.values()}
+    assert len(listing.entries) == len(images) == 4 and {image.camera_id for image in images.values()} == {1, 2}
+    corners = np.array([[0.5, 0.5], [60.0, 10.0], [20.0, 44.0]])
+    for entry in listing.entries:
+        image, ours = images[entry.name], entry.camera(entry.size)
+        turn = image.cam_from_world().rotation.inverse().matrix()
+        expected = np.array([turn @ image.camera.cam_ray_from_img(corner) for corner in corners])
+        np.testing.assert_allclose(directions(ours, corners) @ ours.to_world[:3, :3].T, expected, atol=1e-9)
+        np.testing.assert_allclose(ours.origin, image.projection_center(), atol=1e-12)
 
 
 @pytest.mark.slow

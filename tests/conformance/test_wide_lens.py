@@ -146,6 +146,8 @@ def test_a_wide_camera_is_drawn_with_90_degrees() -> None:
         ("OPENCV_FISHEYE", (50.0, 55.0, 31.0, 22.0, 0.07, -0.04, 0.002, -0.003), Fisheye(0.07, -0.04, 0.002, -0.003)),
         ("SIMPLE_RADIAL_FISHEYE", (50.0, 31.0, 22.0, 0.07), Fisheye(0.07)),
         ("RADIAL_FISHEYE", (50.0, 31.0, 22.0, 0.07, -0.04), Fisheye(0.07, -0.04)),
+        ("SIMPLE_FISHEYE", (50.0, 31.0, 22.0), Fisheye()),
+        ("FISHEYE", (50.0, 55.0, 31.0, 22.0), Fisheye()),
     ],
 )
 def test_colmap_fisheyes(
@@ -155,8 +157,16 @@ def test_colmap_fisheyes(
     survey = survey_photos(write_colmap(tmp_path / "set", model, encoding))
     camera = survey.frames[1].camera
     assert camera.distortion == lens
-    np.testing.assert_array_equal(camera.K, intrinsics(50, parameters[1] if model.startswith("OPENCV") else 50, 31, 22))
+    np.testing.assert_array_equal(camera.K, intrinsics(50, 55 if 55.0 in parameters else 50, 31, 22))
     assert "48 pixels, fisheye" in survey.describe()
+
+
+@pytest.mark.parametrize("encoding", ["bin", "txt"])
+def test_colmap_panoramas(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoding: str) -> None:
+    monkeypatch.setitem(COLMAP_CAMERAS, "EQUIRECTANGULAR", (64.0, 48.0))
+    survey = survey_photos(write_colmap(tmp_path / "set", "EQUIRECTANGULAR", encoding))
+    np.testing.assert_array_equal(survey.frames[1].camera.K, intrinsics(64 / (2 * np.pi), 48 / np.pi, 32, 24))
+    assert "48 pixels, panorama" in survey.describe()
 
 
 def test_cameras_of_nerfstudio_and_instant_ngp(tmp_path: Path) -> None:
