@@ -35,7 +35,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mutation.faults import Fault, draw_faults, read_package
-from mutation.guards import group_entries, list_unrun, read_recording, record_suite
+from mutation.guards import ALL, group_entries, list_unrun, read_recording, record_suite
 from mutation.survivors import Checkout, judge_all, report
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -190,6 +190,7 @@ def judge_random(args: argparse.Namespace) -> None:
             record_suite(untouched, args.jobs, recording, args.slow)
         test_files = {str(path.relative_to(ROOT)): path.read_text() for path in sorted((ROOT / "tests").rglob("test_*.py"))}
         guards = read_recording(recording, group_entries((e.file, e.test) for e in load_entries()), test_files, args.slow)
+        guards.seconds = args.seconds
         first = Checkout(broken[0], untouched, args.limit, {test.name: test.passed for test in guards.tests})
         checkouts = [first, *(replace(first, broken=copy) for copy in broken[1:])]
         report(judge_all(faults, guards, checkouts), len(faults), lambda line: print(line, flush=True))
@@ -220,6 +221,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=2, metavar="J", help="faults of --random that are judged at a time")
     parser.add_argument("--slow", action="store_true", help="of --random: record and run slow tests, too")
     parser.add_argument("--lines", type=Path, metavar="FOLDER", help="of --random: recording to read, or to write if missing")
+    parser.add_argument("--seconds", type=float, default=ALL, metavar="S", help="of --random: recorded time of a fault's tests")
     parser.add_argument("--unrun", action="store_true", help="instead of faults, the statements that no test of --lines runs")
     parser.add_argument("--limit", type=float, default=300, metavar="SECONDS", help="time that one test may take")
     args = parser.parse_args(argv)

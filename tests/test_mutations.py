@@ -243,15 +243,12 @@ def test_the_most_specific_tests_of_a_line_come_first(index) -> None:
     assert found == ["tests/test_a.py::t", "tests/test_b.py::p[2]", "tests/test_b.py::u", "tests/test_b.py::p[1]"]
 
 
-def test_rounds_have_a_time(index, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("seconds", "second"), [(70.0, ["tests/test_b.py::u"]), (45.0, [])])
+def test_rounds_have_a_time(index, monkeypatch: pytest.MonkeyPatch, seconds: float, second: list[str]) -> None:
     monkeypatch.setattr(guards, "FIRST", 45.0)
-    monkeypatch.setattr(guards, "SECOND", 25.0)
-    assert index.rounds(fault_at(13), SMALL) == [
-        ["tests/test_c.py::t", "tests/test_a.py::t", "tests/test_b.py::p[2]"],
-        ["tests/test_b.py::u"],
-        [],
-        [],
-    ]
+    index.seconds = seconds
+    first = ["tests/test_c.py::t", "tests/test_a.py::t", "tests/test_b.py::p[2]"]
+    assert index.rounds(fault_at(13), SMALL) == [first, second, [], []]
     assert index.rounds(fault_at(13, "mivol/unknown.py"), SMALL) == [[], [], [], []]
 
 

@@ -30,13 +30,20 @@ def no_window(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     plt.switch_backend(before)
 
 
-def executed(name: str) -> dict[str, object]:
-    """What a notebook leaves behind: its cells, one after another, in one namespace.
+def executed(name: str, shorter: dict[str, str] | None = None) -> dict[str, object]:
+    """Run the cells of a notebook one after another in one namespace, and return the namespace.
 
     Each cell is compiled under the notebook's name, so that a traceback says where it stopped.
+
+    Args:
+        shorter: texts that each stand in the notebook once, and the texts of a shorter run that replace them.
     """
     space: dict[str, object] = {"__name__": "__main__"}
-    for number, code in enumerate(code_of(FOLDER / f"{name}.ipynb"), 1):
+    cells = code_of(FOLDER / f"{name}.ipynb")
+    for old, new in (shorter or {}).items():
+        assert sum(code.count(old) for code in cells) == 1, old
+        cells = [code.replace(old, new) for code in cells]
+    for number, code in enumerate(cells, 1):
         exec(compile(code, f"{name}.ipynb, code cell {number}", "exec"), space)
     return space
 
@@ -84,11 +91,15 @@ def test_mivol_in_ten_minutes(
 def test_seven_representations(
     two_threads: None, no_window: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Every representation shows the views that it was not fitted to: better than white paper, which has 11 dB."""
+    """Every representation shows the views that it was not fitted to: white paper has 11 dB.
+
+    Half of the squared error of white paper is 14 dB. The two networks take a quarter of the notebook's steps (15 and 21 dB).
+    """
     monkeypatch.chdir(tmp_path)
-    results = executed("seven_representations")["results"]
+    shorter = {'"field.effort": 2.0': '"field.effort": 0.5', '"field.effort": 4.0': '"field.effort": 1.0'}
+    results = executed("seven_representations", shorter)["results"]
     assert list(results) == [
         "dense grid", "network", "octree", "grid with harmonics", "plenoxels", "hash grid", "gaussians"
     ]  # fmt: skip
-    assert all(row["psnr"] > 18 and row["view"].shape[:2] == (64, 64) for row in results.values()), results
+    assert all(row["psnr"] > 14 and row["view"].shape[:2] == (64, 64) for row in results.values()), results
     assert "its leaves fitted" in capsys.readouterr().out

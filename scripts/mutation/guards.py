@@ -23,8 +23,8 @@ from mutation.faults import Fault
 
 __all__ = ["Guards", "RunTest", "group_entries", "is_of_import", "lines_of", "list_unrun", "read_recording", "record_suite"]
 
-FIRST, SECOND = 60.0, 300.0
-"""Recorded time of the tests in the first round and in the second [s]."""
+FIRST, ALL = 60.0, 360.0
+"""Recorded time of the tests in the first round, and in the first two rounds together [s]."""
 
 OF_IMPORTS = ("tests/test_docs.py::test_reference_is_what_the_code_says",)
 """Tests of what imports compute: default arguments, settings and tables stand on the pages of the reference."""
@@ -69,6 +69,7 @@ class Guards:
         listed: the tests of the entries of tests/mutations, by file of the package.
         test_files: text of each test file.
         slow: whether slow tests count.
+        seconds: recorded time of the tests in the first two rounds [s].
     """
 
     tests: list[RunTest] = field(default_factory=list)
@@ -76,6 +77,7 @@ class Guards:
     listed: dict[str, list[str]] = field(default_factory=dict)
     test_files: Mapping[str, str] = field(default_factory=dict)
     slow: bool = False
+    seconds: float = ALL
 
     def find_runners(self, fault: Fault, source: str) -> list[RunTest]:
         """The tests that run the statement of a fault: tests in files called like the module first, then the most specific.
@@ -97,18 +99,19 @@ class Guards:
     def rounds(self, fault: Fault, source: str) -> list[list[str]]:
         """Names of tests for a fault, round by round; a round may be empty.
 
-        1. the tests of the entries of its file, and tests that run its line, ``FIRST`` seconds of them; ``OF_IMPORTS`` for a
-           line that an import runs;
-        2. more tests that run its line, ``SECOND`` seconds of them;
+        1. the tests of the entries of its file, and tests that run its line, ``FIRST`` seconds of them or ``seconds`` if fewer;
+           ``OF_IMPORTS`` for a line that an import runs;
+        2. more tests that run its line, up to ``seconds``;
         3. if slow tests count, those in files called like the module. If no recorded test runs the line, all tests of these
            files, because the recording sees no other processes;
         4. ``OF_SAMPLES`` for code of renders that a recorded test runs.
         """
         runners = self.find_runners(fault, source)
-        first, rest = split_by_time(runners, FIRST)
+        first, rest = split_by_time(runners, min(FIRST, self.seconds))
+        second = split_by_time(rest, self.seconds - FIRST)[0] if self.seconds > FIRST else []
         of_import = OF_IMPORTS if is_of_import(source, fault.line) else ()
         one = list(dict.fromkeys([*self.listed.get(fault.file, []), *of_import, *(test.name for test in first)]))
-        two = [test.name for test in split_by_time(rest, SECOND)[0] if test.name not in one]
+        two = [test.name for test in second if test.name not in one]
         files = self.find_test_files(fault.file, is_unrun=not runners) if self.slow or not runners else []
         which = "not slow" if not self.slow else "slow" if runners else "slow or not slow"
         samples = ["-m", "slow", OF_SAMPLES] if runners and fault.file.startswith(SAMPLING) else []

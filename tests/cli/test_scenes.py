@@ -281,7 +281,7 @@ def test_what_is_said_of_the_tank_in_glass(tmp_path, script):
 @pytest.mark.slow
 def test_models_of_a_cloud(tmp_path, data_dir, script):
     """A few steps of both models from the same photographs, rendered once."""
-    tiny = ("--models", "single", "all", "--size", 12, "--photo-spp", 32, "--iterations", 6)
+    tiny = ("--models", "single", "all", "--size", 8, "--photo-spp", 32, "--iterations", 6)
     said = script("cloud", *tiny, "-o", tmp_path, MIVOL_DATA=str(data_dir))
     rows = re.findall(r"scattering: ([\d.]+) dB .*nRMSE of the volume ([\d.]+), optical depth of columns ([\d.]+)", said)
     assert len(rows) == 2
@@ -444,7 +444,7 @@ def test_relit_smoke(tmp_path, data_dir, script):
 @pytest.mark.slow
 def test_more_views_of_the_smoke(tmp_path, data_dir, script):
     """Ten views predict held-out ones better than two do."""
-    tiny = ("--counts", 2, 10, "--size", 16, "--iterations", 16)
+    tiny = ("--counts", 2, 10, "--size", 10, "--iterations", 16)
     said = script("white_smoke", *tiny, "-o", tmp_path, MIVOL_DATA=str(data_dir))
     psnr = {int(n): float(value) for n, value in re.findall(r"^ *(\d+) views: ([\d.]+) dB", said, re.MULTILINE)}
     assert psnr[10] > psnr[2]

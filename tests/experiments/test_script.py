@@ -196,7 +196,9 @@ def test_photographs_of_the_docs_become_a_scene(two_threads: None, tmp_path: Pat
         Image.fromarray(np.round(rgba * 255).astype(np.uint8)).save(tmp_path / "photographs" / f"{number}.png")
         cameras[f"{number}.png"] = view.camera
     write_transforms(tmp_path / "photographs" / "transforms.json", cameras, [])
-    runpy.run_path(str(SCRIPTS / "photographs.py"))
+    text, tiny = (SCRIPTS / "photographs.py").read_text(), '"field.preset": "tiny"'
+    assert text.count(tiny) == 1
+    exec(compile(text.replace(tiny, f'{tiny}, "field.effort": 0.3'), "photographs.py", "exec"), {"__name__": "__main__"})
     image = np.array(mi.Bitmap("scene.exr"))[..., :3]
     assert np.isfinite(image).all()
     assert image.reshape(-1, 3).std(axis=0).min() > 0.02

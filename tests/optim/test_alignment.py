@@ -82,11 +82,11 @@ def test_refusals(variant_rgb, refine: list[str], views: int, said: str) -> None
 
 
 @pytest.mark.slow
-def test_shifts_and_turns_of_ninety_views(variant_rgb) -> None:
+def test_shifts_and_turns_of_many_views(variant_rgb) -> None:
     """Shifts of a pixel along rows and columns, turns of half a degree, 1e4 quanta: found to .05 pixels and .1 degree."""
     rng = np.random.default_rng(0)
-    moves = rng.standard_normal((90, 3)) * [1, 1, 0.01]
-    beam, grid, exact = scan(90, 32, 96, moves=moves)
+    moves = rng.standard_normal((48, 3)) * [1, 1, 0.01]
+    beam, grid, exact = scan(48, 32, 96, moves=moves)
     counts = np.maximum(rng.poisson(1e4 * np.exp(-exact)), 1.0)
     found = align_views(beam, grid, -np.log(counts / 1e4), counts, ["shift"], NONE)
     error = found.moves - moves
@@ -207,17 +207,18 @@ def test_a_tilt_that_still_moves_is_uncertain(monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.slow
 def test_deviations_of_the_axis(variant_rgb) -> None:
     """Ellipsoids in three parallel beams and three cones: the RMS of the errors over their deviations is below 2, which true
-    normal deviations exceed in one of 1,900 sets. 23 such errors had 0.64; a quarter of the views had 1.79."""
+    normal deviations exceed in one of 1,900 sets. 23 errors of larger scans (48 views of 16 x 48 pixels) had 0.64; a quarter of
+    their views had 1.79."""
     ratios = []
     for seed in range(6):
         rng = np.random.default_rng(seed)
         axis = rng.uniform(-2, 2)
-        beam = ParallelBeam(np.arange(48) * np.pi / 48, (16, 48))
+        beam = ParallelBeam(np.arange(32) * np.pi / 32, (12, 32))
         if seed % 2:
-            beam = ConeBeam(np.arange(48) * np.pi / 24, (16, 48), 150.0, 225.0, 1.5)
-        exact = random_ellipsoids(12, seed, 16).project(replace(beam, moves=np.tile([0.0, axis, 0.0], (48, 1))))
+            beam = ConeBeam(np.arange(32) * np.pi / 16, (12, 32), 100.0, 150.0, 1.5)
+        exact = random_ellipsoids(12, seed, 11).project(replace(beam, moves=np.tile([0.0, axis, 0.0], (32, 1))))
         exact *= 2 / exact.max()
         counts = np.maximum(rng.poisson(1e4 * np.exp(-exact)), 1.0)
-        found = align_views(beam, VoxelGrid((16, 48, 48)), -np.log(counts / 1e4), counts, ["axis"], NONE)
+        found = align_views(beam, VoxelGrid((12, 32, 32)), -np.log(counts / 1e4), counts, ["axis"], NONE)
         ratios.append((found.axis[0] - axis) / found.axis[1])
     assert np.sqrt(np.mean(np.square(ratios))) < 2, ratios

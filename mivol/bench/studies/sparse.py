@@ -78,6 +78,7 @@ class SparseSize(Size):
     side: int = amount(512, 32, "edge of the image whose rays are walked [pixels]")
     walk_res: int = amount(512, 64, "voxels along an edge of the threads and the cloud that are walked")
     cloud_res: int = amount(1024, 64, "voxels along an edge of the cloud")
+    processes: int = amount(2, 1, "processes of each task whose memory is measured; the second finds its kernels on disk")
     image_side: int = amount(256, 16, "edge of the pictures [pixels]")
     image_spp: tuple[int, ...] = amount((4, 4), (2, 2), "samples per pixel of mivol and of volpath")
     image_rounds: int = amount(4, 2, "pictures of each integrator")
@@ -227,8 +228,7 @@ def measure_memory(size: SparseSize) -> dict:
         runs = {}
         for name, path in paths.items():
             for task in MEMORY_TASKS:
-                # The second process finds its kernels on disk.
-                for _ in range(2):
+                for _ in range(size.processes):
                     runs[name, task] = in_new_process(path, size.image_side, task)
     held = runs["cloud", "medium"]["held"]
     more = {task: runs["cloud", task]["peak"] - runs["one brick", task]["peak"] for task in MEMORY_TASKS}
