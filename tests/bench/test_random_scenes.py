@@ -17,15 +17,19 @@ from mivol.bench.harness import contests
 from mivol.bench.harness.contests import mean_of_rounds
 from mivol.bench.studies import random_scenes
 from mivol.bench.studies.random_scenes import (
+    EMITTERS,
+    PLACES,
     STUDY,
+    RandomScene,
     RandomSize,
+    draw_built_scene,
+    draw_scene,
     measure_built,
     measure_hard,
     measure_trials,
     quarter_means,
     try_scene,
 )
-from mivol.bench.studies.random_scenes.generate import EMITTERS, PLACES, RandomScene, draw_built_scene, draw_scene
 from mivol.errors import MivolError
 
 TINY = replace(RandomSize.quick(), scenes=2, rounds=2, spp=1, stock_spp=1, hard_pictures=1)

@@ -24,8 +24,7 @@ from mivol.cli import main
 from mivol.fields.blackbody import blackbody_rgb, planck
 from mivol.files import VolumeData, frame_from_steps, read_volume, write_exr, write_grids
 from mivol.files.mesh import Mesh, write_mesh
-from mivol.scene.pbrt import fold_direction, unfold_sky
-from mivol.scene.pbrt_media import noise
+from mivol.scene.pbrt import fold_direction, noise, unfold_sky
 
 HEAD = """LookAt 0 0 -4  0 0 0  0 1 0   # the eye
 Camera "perspective" "float fov" 0.02
@@ -154,7 +153,7 @@ def test_nanovdb(tmp_path: Path) -> None:
 
 def test_cloud(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Below the height 0.5 - 0.5 the density is 1; above 1 there is none; wisps change it."""
-    monkeypatch.setattr("mivol.scene.pbrt_media.CLOUD_VOXELS", 32)
+    monkeypatch.setattr("mivol.scene.pbrt.CLOUD_VOXELS", 32)
     bounds = '"point3 p0" [0 -.5 0] "point3 p1" [1 1.5 1] '
     found = []
     for wisps in ("0", "1"):
