@@ -186,7 +186,9 @@ def optimize(
         raise MivolError(
             f"found {type(problem).__name__}, expected a problem; write mivol.Problem(scene, references, parameters)."
         )
-    return reconstruct(problem, to_optimizer(optimizer or Adam()), iterations, measure=measure, observer=observer)
+    # An optimizer of mi.ad has a length, and is false before it has parameters.
+    chosen = Adam() if optimizer is None else to_optimizer(optimizer)
+    return reconstruct(problem, chosen, iterations, measure=measure, observer=observer)
 
 
 def explain(

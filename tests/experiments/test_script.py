@@ -81,6 +81,18 @@ def test_any_optimizer_lowers_the_loss(scene: mi.Scene, make) -> None:
     assert np.array(fit.values()[KEY]).max() <= np.float32(0.9)
 
 
+def test_a_given_optimizer_of_mitsuba_makes_the_step(scene: mi.Scene) -> None:
+    """SGD without momentum goes lr times the gradient down. Such an object is false in Python, as its length is 0 at first."""
+    problem = Problem(scene, [seen(0.3)], [mivol.Parameter(KEY, domain=(-np.inf, np.inf))], spp=4)
+    start = problem.initial_reals()
+    gradient = problem.loss_and_gradient(start, 0)[1][KEY]
+    fit = optimize(problem, mi.ad.SGD(lr=0.5), 1)
+    expected = np.array(start[KEY]) - 0.5 * np.array(gradient)
+    assert np.abs(np.array(gradient)).max() > 0
+    # One rounding of the product and one of the sum, each at most half of 2^-23 of values below 2.
+    np.testing.assert_allclose(np.array(fit.values()[KEY]).ravel(), expected.ravel(), rtol=0, atol=2 * 2**-23)
+
+
 def test_references_are_arrays_files_or_a_scene(scene: mi.Scene, folder: Path) -> None:
     write_exr(folder / "seen.exr", {"": seen(0.5)})
     for given in ([seen(0.5)], [folder / "seen.exr"], [str(folder / "seen.exr")], [mi.TensorXf(seen(0.5))]):
