@@ -23,8 +23,9 @@ from mivol.scene.survey import SceneSurvey
 from mivol.space import lattice_from_world
 from mivol.transport.estimators.scores import Primal, Replay, Tangent
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
+from mivol.transport.media.extinction import to_components
 from mivol.transport.media.medium_view import read_asymmetry
-from mivol.transport.path.derivatives import prepare_derivatives, replay_branches
+from mivol.transport.path.derivatives import carry_tangents, prepare_derivatives, replay_branches
 from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.film import CameraRays, LightOfOwnRays, RenderSamples, adjoint_rays, count_passes, render_on_film
 from mivol.transport.path.successive import paths_per_lane, walk_branching, walk_successively
@@ -204,6 +205,12 @@ class GradientTask(RenderTask):
                 estimators = self.build_estimators(scene, arrays)
             media = estimators.media
             media.find_followed()
+            constant = None
+            if len(self.needs.parameters) == 1 and estimators.segment.ends_in_media and not self.aovs:
+                constant = media.find_only_constant()
+            if constant is not None:
+                self._sum_tangents(estimators, constant, self.samples(sensor, arrays, seed), grad_in)
+                return
             media.start_gradients(self.needs.crop_samples)
             # Deliver gradients of volumes after all passes: Dr.Jit follows the edge from a derived value to its parameter only
             # once.
@@ -214,6 +221,26 @@ class GradientTask(RenderTask):
                     dr.eval()
             with dr.resume_grad():
                 media.deliver_gradients()
+
+    def _sum_tangents(
+        self, estimators: Estimators, constant: mi.Float | mi.Color3f, samples: RenderSamples, grad_in: mi.TensorXf
+    ) -> None:
+        """Add the derivative by the only coefficient with gradients: each ray's tangent times d loss / d radiance.
+
+        This takes half the time of a replay. A colour of the radiance depends on one channel only.
+        """
+        estimators.media.start_unit_tangent()
+        total = dr.zeros(mi.Spectrum)
+        with dr.isolate_grad():
+            for rays, dL, _ in adjoint_rays(samples, self.aovs, grad_in):
+                product = dL * _find_tangent(estimators, rays, self.plan.branches)
+                total += mi.Spectrum(*(dr.sum(row) for row in to_components(product)))
+                dr.eval(total)
+        with dr.resume_grad():
+            kind = type(constant)
+            dr.accum_grad(constant, kind(total) if dr.size_v(kind) == dr.size_v(total) else sum(to_components(total)))
+            dr.enqueue(dr.ADMode.Backward, constant)
+            dr.traverse(dr.ADMode.Backward)
 
 
 class TangentTask(RenderTask):
@@ -229,7 +256,8 @@ class TangentTask(RenderTask):
                 estimators.media.find_followed()
                 estimators.media.start_tangent()
             samples = self.samples(sensor, arrays, seed)
-            return render_on_film(samples, self.aovs, lambda rays: _render_tangent(estimators, rays, self.aovs))
+            branches, aovs = self.plan.branches, self.aovs
+            return render_on_film(samples, aovs, lambda rays: _render_tangent(estimators, rays, branches, aovs))
 
 
 OWN_KERNEL = 1 << 16
@@ -262,13 +290,19 @@ def _walk_paths(estimators: Estimators, rays: CameraRays) -> tuple[mi.Spectrum, 
     return score.L, alpha
 
 
-def _render_tangent(estimators: Estimators, rays: CameraRays, aovs: list[str]) -> tuple:
+def _render_tangent(estimators: Estimators, rays: CameraRays, branches: bool, aovs: list[str]) -> tuple:
     """The derivative of the radiance along camera rays, alpha and AOVs, for the film."""
+    tangent = _find_tangent(estimators, rays, branches)
+    return tangent, dr.zeros(mi.Float, dr.width(tangent)), jvp_aovs(estimators.media, rays.ray, aovs)
+
+
+def _find_tangent(estimators: Estimators, rays: CameraRays, branches: bool) -> mi.Spectrum:
+    """The derivative of the radiance along camera rays."""
     prepare_derivatives(estimators, rays.ray)
+    if branches:
+        return carry_tangents(estimators, rays)
     black = zero_radiance(rays.ray)
-    score = Tangent(black, black)
-    score, _ = walk_path(estimators, rays.sampler, rays.ray, score)
-    return score.dL, dr.zeros(mi.Float, dr.width(black)), jvp_aovs(estimators.media, rays.ray, aovs)
+    return walk_path(estimators, rays.sampler, rays.ray, Tangent(black, black))[0].dL
 
 
 def _replay(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum, branches: bool) -> None:

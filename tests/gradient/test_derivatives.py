@@ -15,12 +15,13 @@ from scattering_gradients import along, backward, upper_half
 from scattering_scenes import PLACE, cases, close_up, mivol, rough_grid, sun
 
 from mivol.experiments.script import explain
-from mivol.scene import plan
+from mivol.scene import plan, render_tasks
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import build_estimators, make_plan
 from mivol.scene.survey import survey_scene
-from mivol.transport.estimators.flights.baseline import BLOCKS, BaselineSums
+from mivol.transport.estimators.flights.baseline import BLOCKS, Baseline, BaselineSums
 from mivol.transport.estimators.scores import Replay
+from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path import derivatives
 from mivol.transport.path.derivatives import count_baseline_paths, count_branches, prepare_derivatives
 from mivol.transport.path.estimators import Estimators, Settings
@@ -219,6 +220,110 @@ def test_a_recorded_step_has_branches() -> None:
         plain = np.array(step(scene, integrator, params, mi.TensorXf(values), mi.UInt32(call)))
         # The order of sums over threads is not fixed: float32 sums of some ten thousand terms.
         assert np.abs(found - plain).max() <= 1e-4 * np.abs(plain).max()
+
+
+# -- One number, or one for each channel ------------------------------------------------------------------------------------
+
+
+def fog(*constants: object, boundary: dict | None = None, **more: object) -> mi.Scene:
+    """A medium of constants with a lamp, beside a floor and a ball of the same medium in glass."""
+    interior = medium("mivol_medium", *constants, phase={"type": "mivol_hg", "g": 0.4}, **more)
+    glass = {"type": "sphere", "radius": 0.4, "center": (0.3, 1.5, 0.4), "bsdf": {"type": "dielectric", "int_ior": 1.3}}
+    lamp, shared = {"type": "point", "position": [1.3, -0.6, 1.9], "intensity": 3.0}, {"type": "ref", "id": "fog"}
+    parts = {"fog": interior | {"id": "fog"}, "lamp": lamp, "lit": sky(0.3), "floor": floor()}
+    box = box_of({}, PLACE) | {"interior": shared}
+    return close_up(parts | {"smoke": box | (boundary or {}), "ball": glass | {"interior": shared}}, res=8)
+
+
+COLOURS = {"type": "rgb", "value": [0.9, 0.7, 0.04]}
+SIGMA_T, OWN_ALBEDO = "fog.sigma_t.value.value", "fog.albedo.value.value"
+CONSTANTS = {
+    "thick": (lambda: fog(1.2, 0.8), SIGMA_T),
+    "thin": (lambda: fog(0.1, 0.8), SIGMA_T),
+    "rgb": (lambda: fog({"type": "rgb", "value": [2.0, 1.0, 0.5]}, 0.8), SIGMA_T),
+    "albedo": (lambda: fog(1.2, 0.8), OWN_ALBEDO),
+    "dark": (lambda: fog(0.3, COLOURS), OWN_ALBEDO),
+    "scale": (lambda: fog(1.2, COLOURS, scale=0.7), "fog.scale"),
+    "glass": (lambda: fog(1.2, COLOURS, boundary={"bsdf": {"type": "roughdielectric", "alpha": 0.2}}), SIGMA_T),
+}
+"""Scenes with one followed coefficient: collisions alone, probes, channels, an albedo below the bound of collisions, the scale,
+and a traced boundary."""
+
+
+@pytest.fixture
+def walked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The ways by which derivatives are found."""
+    ways: list[str] = []
+    for name in ("replay_branches", "carry_tangents"):
+        real = getattr(render_tasks, name)
+        monkeypatch.setattr(render_tasks, name, lambda *args, name=name, real=real: ways.append(name) or real(*args))
+    return ways
+
+
+def assert_tangents_are_replays(scene: mi.Scene, key: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The derivative by tangents and by replays, with the same random numbers: the same terms in another order."""
+    w, found = np.random.default_rng(1).uniform(0.5, 1.5, (8, 8, 3)), []
+    for find in (SceneMedia.find_only_constant, lambda self: None):
+        monkeypatch.setattr(SceneMedia, "find_only_constant", find)
+        found.append(backward(scene, key, w, 64, fresh(3), mi.load_dict(mivol(max_depth=5, rr_depth=3))))
+    # Sums in float32 of 4096 paths with some ten terms of both signs each: the sum of sizes is up to 20 times the sum.
+    np.testing.assert_allclose(*found, rtol=2e-4)
+    assert np.all(found[0] != 0)
+
+
+@pytest.mark.parametrize("name", cases(CONSTANTS, slow=("rgb", "dark", "scale", "glass")))
+def test_tangents_give_the_derivative_of_replays(name: str, walked: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    build, key = CONSTANTS[name]
+    assert_tangents_are_replays(build(), key, monkeypatch)
+    assert walked == ["carry_tangents", "replay_branches"]
+
+
+def test_tangents_read_the_baseline_where_a_flight_enters(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A baseline that differs between the blocks of a box."""
+    monkeypatch.setattr(Baseline, "_read", lambda self, block, active: mi.Spectrum(0.1 * mi.Float(block % 5)))
+    smoke = box_of(medium("homogeneous", 1.2, 0.8), PLACE)
+    assert_tangents_are_replays(close_up({"smoke": smoke, "lit": sky(0.3)}, res=8), MEDIUM + "sigma_t.value.value", monkeypatch)
+
+
+def test_tangents_are_for_one_constant_alone(walked: list[str]) -> None:
+    """Two coefficients, a surface, both, a grid, an AOV and a fire are replayed."""
+
+    def differentiate(scene: mi.Scene, *keys: str, **more: object) -> None:
+        params = mi.traverse(scene)
+        for key in keys:
+            dr.enable_grad(params[key])
+        grad_in = dr.ones(mi.TensorXf, (8, 8, 4 if more else 3))
+        mi.load_dict(mivol(max_depth=3, **more)).render_backward(scene, params, grad_in, seed=0, spp=1)
+
+    differentiate(fog(1.2, 0.8), SIGMA_T)
+    assert walked == ["carry_tangents"]
+    differentiate(fog(1.2, 0.8), SIGMA_T, OWN_ALBEDO)
+    differentiate(fog(1.2, 0.8), KEYS["floor"])
+    differentiate(fog(1.2, 0.8), KEYS["floor"], SIGMA_T)
+    differentiate(fog(1.2, 0.8), SIGMA_T, aovs="depth")
+    differentiate(fog(1.2, 0.8, emission=0.1), SIGMA_T)
+    differentiate(smoky(), KEYS["density"])
+    differentiate(smoky(), KEYS["albedo"])
+    assert walked[1:] == ["replay_branches"] * 7
+
+
+def test_tangents_add_to_what_a_latent_number_has() -> None:
+    """albedo = x / 2 in two images, beside a loss of x itself: all derivatives reach x."""
+    scene, integrator = fog(1.2, 0.8), mi.load_dict(mivol(max_depth=4))
+    params = mi.traverse(scene)
+    x = mi.Float(1.6)
+    dr.enable_grad(x)
+    params[OWN_ALBEDO] = x / 2
+    params.update()
+    images = [mi.render(scene, params, integrator=integrator, spp=4, seed=fresh(k)) for k in range(2)]
+    dr.backward(3 * x + sum(dr.sum(image, axis=None) for image in images))
+    alone = [backward(scene, OWN_ALBEDO, np.ones((8, 8, 3)), 4, find_gradient_seed(fresh(k)), integrator) for k in range(2)]
+    assert dr.grad(x)[0] == pytest.approx(3 + 0.5 * float(np.sum(alone)), rel=1e-5)
+
+
+def find_gradient_seed(seed: int) -> int:
+    """The seed of derivatives that ``mi.render`` takes for an image of this seed."""
+    return int(mi.sample_tea_32(seed, 1)[0])
 
 
 ALBEDO, SIGMA = 0.8, 0.05

@@ -361,8 +361,8 @@ def test_side_flights_keep_the_mean_of_derivatives(name, monkeypatch):
 
 @pytest.mark.slow_for("emission-5")
 @pytest.mark.parametrize(("name", "depth"), [("emission", 5), ("emitter", 5)])
-def test_light_is_linear_in_what_emits(name, depth):
-    """The derivative along an emission is the image of this emission alone, sample by sample."""
+def test_light_is_linear_in_what_emits(name, depth, whole_paths):
+    """The derivative along an emission is the image of this emission alone, sample by sample (images have no branches here)."""
     scene, key = _everything(), PARAMETERS[name]
     integrator, params = mi.load_dict(mivol(max_depth=depth, rr_depth=3)), mi.traverse(scene)
     kind, value = type(params[key]), np.array(params[key], dtype=np.float32)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import replace
 from functools import cached_property
 
 import drjit as dr
@@ -216,6 +217,34 @@ class SceneMedia:
                 dr.accum_grad(values, gradient)
                 dr.enqueue(dr.ADMode.Backward, values)
             dr.traverse(dr.ADMode.Backward)
+
+    def find_only_constant(self) -> mi.Float | mi.Color3f | None:
+        """The only coefficient with gradients, if it is the same everywhere in its medium: a part of the extinction, times the
+        scale of the medium, or the albedo. None for any other coefficient, for several, and beside emitting media.
+        """
+        found: dict[tuple, mi.Float | mi.Color3f | None] = {}
+        for body in self.bodies:
+            view = body.view
+            if view.emits or is_followed(view.microflakes):
+                return None
+            for k, part in enumerate(view.parts):
+                if body.follows[k]:
+                    with dr.resume_grad():
+                        found[view.medium.ptr, k] = part.scaled(view.scale) if part.is_constant else None
+            if body.follows_albedo and view.albedo is not None:
+                found[view.medium.ptr, "albedo"] = None if isinstance(view.albedo, mi.Volume) else view.albedo
+        return next(iter(found.values())) if len(found) == 1 else None
+
+    def start_unit_tangent(self) -> None:
+        """Begin a forward pass along :meth:`find_only_constant`, with a tangent of 1 in every channel."""
+        for body in self.bodies:
+            body.has_tangent, body.tangents = body.follows, [type(part.values)(1) for part in body.view.parts]
+            if body.follows_albedo and body.view.albedo is not None:
+                with dr.resume_grad():
+                    albedo = dr.detach(body.view.albedo)
+                    dr.enable_grad(albedo)
+                    dr.set_grad(albedo, 1)
+                body.view = replace(body.view, albedo=albedo)
 
     def start_tangent(self) -> None:
         """Begin a forward pass: take the tangent of each part from the parameters."""

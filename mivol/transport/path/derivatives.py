@@ -1,5 +1,5 @@
-r"""Derivatives of paths that scatter in media: their baseline, and reverse derivatives of paths branching at the first
-collision.
+r"""Derivatives of paths that scatter in media: their baseline, and derivatives of paths branching at the first collision, by
+replays (reverse mode) or tangents (forward mode, and reverse mode for one number).
 
 .. math:: L = \frac{1}{k} \sum_{j=1}^{k} L_j
 
@@ -28,14 +28,22 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.estimators.flights.baseline import Baseline, BaselineSums
-from mivol.transport.estimators.scores import Factor, Replay, Rest
+from mivol.transport.estimators.scores import Factor, Replay, Rest, Tangent
 from mivol.transport.estimators.segment import SegmentTransmittance
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays
-from mivol.transport.path.walk import PathStart, leave_camera_from_memory, walk_from_camera, walk_light, walk_part
+from mivol.transport.path.walk import (
+    Path,
+    PathStart,
+    leave_camera_from_memory,
+    walk_from_camera,
+    walk_in_kernel,
+    walk_light,
+    walk_part,
+)
 from mivol.transport.traversal.random_numbers import SpreadSampler
 
-__all__ = ["count_branches", "prepare_derivatives", "replay_branches"]
+__all__ = ["carry_tangents", "count_branches", "prepare_derivatives", "replay_branches"]
 
 
 MAX_BRANCHES = 8
@@ -90,10 +98,9 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
 
     # -- The radiance of stems and branches ------------------------------------------------------------------------------
     stem_light, _, stems = walk_light(replayed, start.clone(), stops=True)
-    baseline = estimators.segment.baseline
     light, lane = _PackedLight.of(stem_light), dr.arange(mi.UInt32, n)
     dr.schedule(dL)
-    branching = _Branching.of(PathStart.at_stop(stems, first), USUAL_NOISE if baseline is None else baseline.noise)
+    branching = _Branching.of(estimators, stems, first)
     stem, branches = branching.gather(lane)
     L, _, path = walk_light(replayed, branches.in_memory(), stops=False)
     light.add(L * branching.share, stem, branches.active)
@@ -111,6 +118,32 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
         walk_part(estimators, begun, score, is_stem, ("first", "later"))
 
     replay_in_one_kernel(n, replay)
+
+
+def carry_tangents(estimators: Estimators, rays: CameraRays) -> mi.Spectrum:
+    """The tangent of the radiance along camera rays, from the tangents of the parameters.
+
+    Stems and branches carry their tangents along, so each is walked once.
+
+    Args:
+        estimators, rays: as of :func:`replay_branches`.
+    """
+    first = rays.sampler.clone()
+    start = leave_camera_from_memory(estimators, rays.sampler, rays.ray)
+    lane, probes = dr.arange(mi.UInt32, dr.width(start.ray)), ("first", "later")
+    black = dr.zeros(mi.Spectrum, len(lane))
+    # In memory as the tangents of branches are, so that stems and branches run one kernel.
+    dlog = dr.zeros(mi.Spectrum, len(lane))
+    dr.make_opaque(dlog)
+    score, _, stems = walk_in_kernel(estimators, start, Tangent(black, dlog), stops=True, probes=probes)
+    total = _PackedLight.of(score.dL)
+    branching = _Branching.of(estimators, stems, first)
+    stem, branches = branching.gather(lane)
+    dlog = dr.gather(mi.Spectrum, score.dlog, stem)
+    dr.eval(dlog)
+    score, _, _ = walk_in_kernel(estimators, branches.in_memory(), Tangent(black, dlog), stops=False, probes=probes)
+    total.add(score.dL * branching.share, stem, branches.active)
+    return total.gather(lane)
 
 
 def replay_in_one_kernel(width: int, walk: Callable[[mi.Bool], object]) -> None:
@@ -183,14 +216,16 @@ class _Branching:
     each: mi.UInt32
 
     @classmethod
-    def of(cls, start: PathStart, noise: mi.Float | float) -> _Branching:
+    def of(cls, estimators: Estimators, stems: Path, sampler: SpreadSampler) -> _Branching:
         """List the stems with a collision, and choose the number of branches.
 
         Args:
-            start: as in the class.
-            noise: as of :func:`count_branches`.
+            estimators: estimators of the render.
+            stems: stems at their ends.
+            sampler: random numbers of the stems from the camera on.
         """
-        n = dr.width(start.active)
+        start, baseline = PathStart.at_stop(stems, sampler), estimators.segment.baseline
+        noise, n = USUAL_NOISE if baseline is None else baseline.noise, dr.width(start.active)
         count, collided = dr.opaque(mi.UInt32, 0), dr.zeros(mi.UInt32, n)
         place = dr.scatter_inc(count, mi.UInt32(0), start.active)
         dr.scatter(collided, dr.arange(mi.UInt32, n), place, start.active)

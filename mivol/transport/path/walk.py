@@ -62,6 +62,7 @@ __all__ = [
     "leave_camera_from_memory",
     "start_path",
     "walk_from_camera",
+    "walk_in_kernel",
     "walk_light",
     "walk_part",
     "walk_path",
@@ -360,26 +361,41 @@ def walk_part(
 def walk_light(
     estimators: Estimators, start: PathStart, stops: bool, shares: bool = True
 ) -> tuple[mi.Spectrum, mi.Float, Path]:
-    """Find the light of paths.
-
-    Args:
-        estimators: estimators of the render; their segments end in media.
-        start: starts of the paths.
-        stops: whether the paths are stems, which end at their first collision.
-        shares: whether images, stems and branches share the kernel of the walk, so that it is compiled once. Their starts are
-            in memory then (:func:`leave_camera_from_memory`, :meth:`PathStart.in_memory`), and the results are evaluated.
+    """Find the light of paths (arguments: :func:`walk_in_kernel`).
 
     Returns:
         Radiance, alpha for the film (in [0, 1]), and the paths at their ends.
     """
+    black = dr.zeros(mi.Spectrum, dr.width(start.ray))
+    score, alpha, path = walk_in_kernel(estimators, start, Primal(black), stops, shares)
+    return score.L, alpha, path
+
+
+def walk_in_kernel(
+    estimators: Estimators, start: PathStart, score: Score, stops: bool, shares: bool = True, probes: tuple[str, ...] = ()
+) -> tuple[Score, mi.Float, Path]:
+    """Walk stems or branches in a kernel of their own.
+
+    Args:
+        estimators: estimators of the render; their segments end in media.
+        start: starts of the paths.
+        score: accumulator of radiance or of its tangent.
+        stops: whether the paths are stems, which end at their first collision.
+        shares: whether images, stems and branches share the kernel of the walk, so that it is compiled once. Their starts are
+            in memory then (:func:`leave_camera_from_memory`, :meth:`PathStart.in_memory`), and the results are evaluated.
+        probes: as of :func:`_start_reservoirs`.
+
+    Returns:
+        The score, alpha for the film (in [0, 1]), and the paths at their ends.
+    """
     stem = dr.opaque(mi.Bool, stops)
     if shares:
         begin_kernel(start, stem)
-    path = walk_part(estimators, start, Primal(dr.zeros(mi.Spectrum, dr.width(start.ray))), stem)
+    path = walk_part(estimators, start, score, stem, probes)
     alpha = dr.select(path.known.on, 1, film_alpha(path))
     if shares:
-        begin_kernel(path.score.L, alpha, (path.ray, path.medium, path.beta, path.eta, path.depth, path.known))
-    return path.score.L, alpha, path
+        begin_kernel(path.score, alpha, (path.ray, path.medium, path.beta, path.eta, path.depth, path.known))
+    return path.score, alpha, path
 
 
 def advance_path(estimators: Estimators, path: Path, collision: Collision | None = None, stops: mi.Bool | None = None) -> Path:

@@ -141,8 +141,7 @@ class FlightSegment:
     def jvp_light(self) -> mi.Spectrum:
         total = mi.Spectrum(0)
         if self.baseline is not None:
-            # A baseline that varies would need a second walk.
-            total -= self._scattered * self.baseline.average * self._jvp_extinction
+            total -= self._scattered * self._flight_baseline * self._jvp_extinction
         if self.gaussian_light is not None:
             total += self.gaussian_light.jvp()
         if self.emission is None:
@@ -166,6 +165,16 @@ class FlightSegment:
         front = RaySegment.upto(self.segment.ray, self.segment.medium, self.emission.point.t)
         front.u = self.passed.u
         return front
+
+    @property
+    def _flight_baseline(self) -> mi.Spectrum:
+        """The baseline of the only medium with a tangent, if it is constant along the flight; else its mean.
+
+        A baseline that varies along the flight would need a second walk.
+        """
+        followed = [body for body in self.media.bodies if any(body.has_tangent)]
+        b = self.baseline.along(followed[0], self.segment.ray, self.active) if len(followed) == 1 else None
+        return self.baseline.average if b is None or callable(b) else b
 
     # -- Throughput ------------------------------------------------------------------------------------------------------
 
