@@ -17,7 +17,7 @@ from mivol.fields.protocol import BOUNDED, accumulate_tracked
 class Ball:
     """A sphere of constant extinction; its majorant is ``slack`` times as large as need be."""
 
-    line = BOUNDED
+    line, may_jump, resolution = BOUNDED, True, (40, 40, 40)
 
     def __init__(self, sigma: mi.Float | mi.Color3f, radius: float, centre: tuple, slack: float = 1.0) -> None:
         self.sigma, self.radius, self.centre, self.slack = sigma, radius, mi.ScalarPoint3f(centre), slack

@@ -17,6 +17,7 @@ References: Müller et al. 2022 (encoding). Their activation, an exponential, ha
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -54,6 +55,7 @@ class HashDensity:
 
     line: ClassVar[str] = BOUNDED
     channels: ClassVar[int] = 1
+    may_jump: ClassVar[bool] = False
 
     def __init__(self, sizes: HashSizes, to_world: np.ndarray, largest: float, tensors: dict[str, mi.TensorXf]) -> None:
         if not 0 < largest < np.inf:
@@ -110,6 +112,20 @@ class HashDensity:
         layers = [nn.view(self.tensors[f"weights_{k}"]) for k in range(len(self.sizes.density_network.shapes))]
         raw = Network.eval_lanes(layers, self.encoding.encode(self.tensors["table"].array, unit, inside))[0]
         return dr.select(inside, self.largest * dr.rcp(1 + dr.exp(SHIFT - raw)), 0)
+
+    @property
+    def resolution(self) -> tuple[int, int, int]:
+        """Cells (Z, Y, X) of the finest level."""
+        return self.encoding.levels[-1].cells[::-1]
+
+    def slopes(self, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> list[mi.Vector3f]:
+        fixed = copy(self)
+        fixed.tensors = dr.detach(self.tensors)
+        with dr.resume_grad():
+            place = mi.Point3f(p)
+            dr.enable_grad(place)
+            dr.backward_from(fixed.eval(place, w, active)[0])
+            return [mi.Vector3f(dr.grad(place))]
 
     def accumulate(self, p: mi.Point3f, w: mi.Vector3f, d: list[mi.Float], active: mi.Bool) -> None:
         accumulate_tracked(self, p, w, d, active)

@@ -21,6 +21,10 @@ from mivol.scene_graph import list_values, traverse
 __all__ = ["PluginField"]
 
 
+UNKNOWN = 64
+"""Cells along each axis of a volume that names no resolution."""
+
+
 class PluginField:
     """A bounded extinction (:class:`mivol.fields.protocol.Field`) that calls a volume plugin at points.
 
@@ -37,6 +41,7 @@ class PluginField:
     """
 
     line: ClassVar[str] = BOUNDED
+    may_jump: ClassVar[bool] = True  # as a gridvolume of the nearest voxels does
 
     def __init__(self, volume: mi.Volume) -> None:
         self.volume, self.kind = volume, type(volume).__name__
@@ -46,6 +51,8 @@ class PluginField:
             found = f"the volume {self.kind} has the bounding box {low} to {high}"
             raise MivolError(f"{found}; a finite box is expected: give to_world.")
         self.to_world = frame_from_box(low, high)
+        size = tuple(int(n) for n in volume.resolution())[::-1]
+        self.resolution = size if max(size) > 1 else (UNKNOWN,) * 3
         self.channels = 1 if mi.is_monochromatic or volume.channel_count() == 1 else 3
 
     def eval(self, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> list[mi.Float]:

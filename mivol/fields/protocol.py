@@ -4,7 +4,8 @@ r"""The protocol of a field that transport uses as an extinction: values and der
 
 ``line`` declares the knowledge along a ray. ``EXACT_LINE``: transport computes the optical depth, and the distance at which a
 ray reaches it, cell by cell or in closed form. ``BOUNDED``: transport knows only f at points and a majorant; it estimates
-transmittance with the majorant, and derivatives at random points.
+transmittance with the majorant, and derivatives at random points. Where noise is not asked for (``deterministic``, AOVs, a
+moving emitter), it integrates f by Gauss points in the cells of ``resolution``.
 
 Conventions. A field is 0 outside its box, the unit cube under ``to_world``. A plugin (:mod:`mivol.plugins`) hands the field to
 transport as ``mivol_extinction``, and its parameters to ``mi.traverse``.
@@ -28,11 +29,15 @@ class Field(Protocol):
         line: EXACT_LINE or BOUNDED.
         channels: 1 (grey) or 3 (rgb).
         to_world: (4, 4) float64, unit cube to world.
+        resolution: of a BOUNDED field, the number of cells along its axes (Z, Y, X) that show its finest detail.
+        may_jump: whether values of a BOUNDED field may jump inside the box; otherwise it has ``slopes``.
     """
 
     line: str
     channels: int
     to_world: np.ndarray
+    resolution: tuple[int, int, int]
+    may_jump: bool
 
     def eval(self, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> list[mi.Float]:
         """Values of each channel at world points for light travelling along ``w``; attached to the parameters.
@@ -42,6 +47,9 @@ class Field(Protocol):
 
     def accumulate(self, p: mi.Point3f, w: mi.Vector3f, d: list[mi.Float], active: mi.Bool) -> None:
         """Add ``d`` (d loss / d value of each channel) at points to the gradients of the parameters: the transpose of eval."""
+
+    def slopes(self, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> list[mi.Vector3f]:
+        """Derivative of each channel by the world point, of a BOUNDED field without jumps inside its box; no derivatives."""
 
     def bound(self) -> list[float]:
         """An upper bound of each channel over the box. Reads values, which ``dr.freeze`` cannot record."""

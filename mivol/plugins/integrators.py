@@ -23,7 +23,8 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
         rr_depth: depth from which Russian roulette may end a path. Default 5.
         hide_emitters: do not show emitters to the camera. Default false.
         deterministic: scattered light by quadrature along the ray, without noise; at depth 2, for point, spot and directional
-            lights. Derivatives are still sampled. The quadrature has a small error (docs/limits.md). Default false.
+            lights. Derivatives are still sampled. The quadrature has a small error (docs/limits.md). Volumes known at points
+            (``mivol_hash``) are integrated without noise too. Default false.
         shadows: exact; estimated: unbiased, from a few look-ups, in images (gradients walk every cell); grid: with
             ``deterministic``, looked up in a lattice of optical depths; auto: exact, or estimated for fine grids, and in images
             of media that scatter several times one exact shadow ray a path, chosen without bias by a table. Default auto.

@@ -147,17 +147,23 @@ def choose_transport(needs: Needs, settings: Settings, segment: str) -> Choice:
     if is_scattering_visible(needs, settings):
         where = "by quadrature" if settings.deterministic else "at a distance sampled in proportion to the scattered light"
         shadows = "a light grid for shadows" if settings.shadows == "grid" else "exact shadow rays"
-        method = f"exact optical depth; one scattering {where}, {shadows}"
+        method = f"{_describe_depths(needs, settings)}; one scattering {where}, {shadows}"
         return Choice("media", method, "an albedo is above 0 and max_depth is 2")
     why = "albedo 0" if not any(m.is_scattering for m in needs.media) else "max_depth 1 includes no scattered light"
     if any(m.unread for m in needs.media):
         why = "values cannot be read while dr.freeze records; max_depth or an earlier render implies absorption only"
-    tracked = [m.name for m in needs.media if m.bounded]
-    method = (
-        "exact optical depth" if not tracked else f"transmittance of {', '.join(tracked)} by ratio tracking, exact elsewhere"
-    )
-    method += "; no phase function, no light sampling in media, no albedo look-up"
+    method = f"{_describe_depths(needs, settings)}; no phase function, no light sampling in media, no albedo look-up"
     return Choice("media", method, why)
+
+
+def _describe_depths(needs: Needs, settings: Settings) -> str:
+    """How optical depths are found."""
+    names = ", ".join(m.name for m in needs.media if m.bounded)
+    if not names:
+        return "exact optical depth"
+    if settings.deterministic:
+        return f"optical depth of {names} by two points in each half of a cell, exact elsewhere"
+    return f"transmittance of {names} by ratio tracking, exact elsewhere"
 
 
 def _explain_free_flights(needs: Needs, settings: Settings) -> str:

@@ -214,7 +214,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         MivolError: a request that mivol does not answer (quadrature of several scatterings, derivatives of shapes), or a
             gradient step larger than the memory.
     """
-    check_bounded(needs, settings, aovs)  # first: a medium without optical depths has no other way out
+    check_bounded(needs, settings)
     check_scattering(needs, settings)
     check_emission_cells(needs, settings)
     check_quadrature(needs, settings)
@@ -303,9 +303,20 @@ def _round_share(occupied: float) -> float:
     return math.ceil(occupied / OCCUPIED_STEP) * OCCUPIED_STEP
 
 
+def settings_for(settings: Settings, needs: Needs, for_images: bool) -> Settings:
+    """The settings of an integrator for a purpose: quadrature of a field known at points is for images only.
+
+    Its derivatives are Monte Carlo estimates, as those of other quadrature, but its flights need no cells.
+    """
+    if for_images or not any(m.bounded for m in needs.media):
+        return settings
+    return replace(settings, deterministic=False, shadows="auto" if settings.shadows == "grid" else settings.shadows)
+
+
 def choose_segment(needs: Needs, settings: Settings) -> str:
     """Choose the name of the segment estimator. Requests without an estimator have been refused before."""
-    emits, is_bounded = any(m.emits for m in needs.media), any(m.bounded for m in needs.media)
+    emits = any(m.emits for m in needs.media)
+    is_bounded = any(m.bounded for m in needs.media) and not settings.deterministic
     scatters = (emits or bool(needs.emitter_kinds)) and is_scattering_visible(needs, settings)
     question = SegmentNeeds(
         scatters,
@@ -401,11 +412,14 @@ def build_estimators(
     """Build the planned estimators, for images or for derivatives; ``readings`` and ``tracer`` as for :func:`build_media`."""
     draws_near_light = plan.draws_near_light if for_images else plan.near_light_in_derivatives
     media = build_media(scene, needs, plan, survey, readings, for_images, tracer)
+    if settings.deterministic:
+        media = media.by_quadrature()
     direct = DirectLighting(media)
     choice = SegmentInputs(direct, plan.scattering_points)
     if plan.segment in ("single_scattering", "scattering_quadrature"):
         with dr.suspend_grad():
-            choice.visibility_cache = _make_visibility_cache(direct, needs, plan, survey, for_images)
+            if not any(m.bounded for m in needs.media):
+                choice.visibility_cache = _make_visibility_cache(direct, needs, plan, survey, for_images)
             if settings.shadows == "grid":
                 lattice = next(p.lattice for p in media.bodies[0].view.parts if p.lattice is not None)
                 choice.transmittance_grid = TransmittanceGrid.over_lattice(media, direct.emitters, lattice)

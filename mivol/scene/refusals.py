@@ -53,7 +53,8 @@ def check_scattering(needs: Needs, settings: Settings) -> None:
 
 def check_emission_cells(needs: Needs, settings: Settings) -> None:
     """Refuse emission that varies faster than the integrated cells."""
-    for facts, view in zip(needs.media, needs.views, strict=True):
+    views = [view.by_quadrature() if settings.deterministic else view for view in needs.views]
+    for facts, view in zip(needs.media, views, strict=True):
         if isinstance(view.emission_density, mi.Volume) and not have_same_cells(view.walked_lattice, view.emission_lattice):
             raise MivolError(
                 f"the emission_density of the medium in {facts.name} has {view.emission_lattice.res} voxels (Z, Y, X) and its "
@@ -96,7 +97,7 @@ def check_quadrature(needs: Needs, settings: Settings) -> None:
             f"deterministic is set and the scene has a {other[0]}; quadrature is for emitters of one position or direction "
             "(point, spot, directional): leave deterministic out."
         )
-    if len(needs.media) > 1 or not shares_cells(needs.views[0]):
+    if len(needs.media) > 1 or not shares_cells(needs.views[0].by_quadrature()):
         medium, found = needs.media[0], f"the scene has {len(needs.media)} media"
         if len(needs.media) == 1:
             grids = f"{len(medium.resolutions)} grids of unlike cells" if medium.resolutions else "no grid"
@@ -133,27 +134,30 @@ def check_near_light(needs: Needs, settings: Settings, segment: str) -> None:
         raise MivolError(f"near_light is 'segments', and {why[0].reason}: leave it at auto.")
 
 
-def check_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> None:
-    """Refuse requests for exact optical depths in a scene with a bounded field."""
+def check_bounded(needs: Needs, settings: Settings) -> None:
+    """Refuse rgb collisions in a field known at points, and derivatives by emitters whose shadows may jump with its values."""
     medium = next((m for m in needs.media if m.bounded), None)
     if medium is None:
         return
     moved = _emitter_placements(needs)
     collides = is_scattering_visible(needs, settings) or any(m.emits for m in needs.media)
     parts = [(facts.name, part) for facts, view in zip(needs.media, needs.views, strict=True) for part in view.parts]
-    rgb = [name for name, part in parts if not part.exact_line and part.channels == 3] if collides else []
+    bounded = [(name, part) for name, part in parts if not part.exact_line]
+    rgb = [name for name, part in bounded if part.channels == 3] if collides and not settings.deterministic else []
     reasons = [
-        (bool(aovs), f"aovs asks for {', '.join(aovs)}", "leave aovs out"),
-        (settings.deterministic, "deterministic is set", "leave it out, for transmittance is estimated"),
         (
             bool(rgb),
             f"a medium scatters or emits, and the bounded field of {', '.join(rgb)} is rgb",
             "make it grey (a plugin's channel_count(): 1)",
         ),
-        (bool(moved), f"the derivative of {', '.join(moved)} was requested", "use finite differences"),
+        (
+            bool(moved) and any(part.field.may_jump for _, part in bounded),
+            f"the derivative of {', '.join(moved)} was requested, which misses jumps of its values",
+            "use finite differences",
+        ),
     ]
-    kind = f"is a {medium.bounded}, which is bounded (a majorant is known, and no optical depth of a ray)"
-    _raise_first(f"the medium in {medium.name} {kind}", reasons, "voxelise the field (nodes of a mivol_hash)")
+    kind = f"is a {medium.bounded}, which is known at points only"
+    _raise_first(f"the medium in {medium.name} {kind}", reasons, "sample it to a mivol_voxels")
 
 
 def check_gaussians(needs: Needs, aovs: tuple[str, ...]) -> None:

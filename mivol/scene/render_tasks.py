@@ -74,6 +74,7 @@ class PlannedScene:
         needs: facts without arrays: a kept view of a medium would keep the derivatives of an earlier step.
         plan: choices for the scene.
         arrays: arrays made for the plan.
+        settings: of the integrator, for this purpose.
         places: where groups of numbers are in ``arrays.placements`` (:func:`prepare_placements`).
         unrecorded: why renders are not recorded; None if they are.
         image_needs: facts of the image from which derivatives were planned; None if they were found for the derivatives.
@@ -85,6 +86,7 @@ class PlannedScene:
     needs: Needs
     plan: Plan
     arrays: PreparedArrays
+    settings: Settings
     places: dict[bytes, int]
     unrecorded: str | None = None
     image_needs: Needs | None = None
@@ -142,15 +144,15 @@ class RenderTask(RecordedTask):
     """A render of a scene whose plan is made.
 
     Args:
-        opened: facts and plan of the scene, and the samples per pixel.
-        settings, aovs: as in :class:`mivol.scene.session.Session`.
+        opened: facts and plan of the scene, settings, and the samples per pixel.
+        aovs: as in :class:`mivol.scene.session.Session`.
         for_images: True for estimators of images, False for estimators of derivatives.
     """
 
-    def __init__(self, opened: PlannedScene, settings: Settings, aovs: list[str], for_images: bool) -> None:
+    def __init__(self, opened: PlannedScene, aovs: list[str], for_images: bool) -> None:
         super().__init__()
         self.survey, self.needs, self.plan = opened.survey, opened.needs, opened.plan
-        self.spp, self.settings, self.aovs, self.for_images = opened.spp, settings, aovs, for_images
+        self.spp, self.settings, self.aovs, self.for_images = opened.spp, opened.settings, aovs, for_images
         self.places = opened.places
 
     def build_estimators(self, scene: mi.Scene, arrays: PreparedArrays) -> Estimators:

@@ -29,7 +29,7 @@ from mivol.scene.needs import (
     warn_of_clipped_view,
     warn_of_misplaced_grids,
 )
-from mivol.scene.plan import make_plan, plan_key, read_parts
+from mivol.scene.plan import make_plan, plan_key, read_parts, settings_for
 from mivol.scene.previews import measure_noise, warn_of_last_order
 from mivol.scene.readings import release_unread
 from mivol.scene.refusals import parse_aovs
@@ -170,7 +170,7 @@ class Session:
         with dr.suspend_grad():
             sensor = find_sensor(scene, 0)
             opened = self._open(scene, sensor, 1, self._read_state(scene, sensor, True), for_images=True)
-            task = RenderTask(opened, self.settings, self.aovs, for_images=True)
+            task = RenderTask(opened, self.aovs, for_images=True)
             estimators = task.build_estimators(scene, opened.read_arrays())
             media = estimators.media
             named = [sensor.get_medium() for sensor in scene.sensors()]
@@ -196,7 +196,7 @@ class Session:
         """
 
         def make() -> RenderTask:
-            return kind(opened, self.settings, self.aovs)
+            return kind(opened, self.aovs)
 
         given = (scene, sensor, opened.read_arrays(), *inputs)
         if is_recording() or opened.unrecorded is not None:
@@ -318,13 +318,14 @@ class Session:
         known = next(iter(self._opened.values()), None)
         with with_placements(None if known is None else known.arrays.placements, {} if known is None else known.places):
             needs = find_needs(scene, sensor, survey, spp, self.settings.may_draw_emission, state.differentiated)
+        settings = settings_for(self.settings, needs, for_images)
         warn_of_misplaced_grids(needs, survey)
         warn_of_clipped_view(needs, sensor, survey)
         with dr.suspend_grad():
-            needs = measure_noise(scene, sensor, needs, survey, self.settings, for_images)
-        plan = make_plan(needs, self.settings, self.aovs)
+            needs = measure_noise(scene, sensor, needs, survey, settings, for_images)
+        plan = make_plan(needs, settings, self.aovs)
         if not self.is_depth_given:
-            warn_of_last_order(scene, sensor, needs, plan, survey, self.settings)
+            warn_of_last_order(scene, sensor, needs, plan, survey, settings)
         light = None if needs.media_light is None else (needs.media_light.density, needs.media_light.cumulative)
         if not is_recording() and known is not None and known.state.others == state.others:
             placements, places = known.arrays.placements, known.places
@@ -333,7 +334,8 @@ class Session:
         readings = read_parts(needs, plan, survey, for_images)
         arrays = PreparedArrays(readings, light, find_batch_views(sensor), placements, survey.usable_tracer)
         self._views = needs.views if for_images and not is_recording() else ()
-        opened = PlannedScene(state, spp, survey, replace(needs, views=(), media_light=None), plan, arrays, places)
+        facts = replace(needs, views=(), media_light=None)
+        opened = PlannedScene(state, spp, survey, facts, plan, arrays, settings, places)
         return self._find_unrecorded(opened, scene, for_images)
 
     def _open_like_image(
@@ -352,10 +354,12 @@ class Session:
         needs = image.needs.with_parameters(state.differentiated)
         if needs is None:
             return None
-        plan = make_plan(replace(needs, views=views), self.settings, self.aovs)
+        settings = settings_for(self.settings, needs, for_images=False)
+        plan = make_plan(replace(needs, views=views), settings, self.aovs)
         if plan.readings(for_images=False) != image.plan.readings(for_images=True):
             return None
-        opened = PlannedScene(state, spp, image.survey, needs, plan, image.arrays, image.places, image_needs=image.needs)
+        made = image.survey, needs, plan, image.arrays, settings, image.places
+        opened = PlannedScene(state, spp, *made, image_needs=image.needs)
         return self._find_unrecorded(opened, scene, for_images=False)
 
     def _find_unrecorded(self, opened: PlannedScene, scene: mi.Scene, for_images: bool) -> PlannedScene:

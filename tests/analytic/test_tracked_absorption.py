@@ -246,19 +246,16 @@ def test_several_passes_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 REFUSED = {
-    "aovs": ({"max_depth": 1, "aovs": "tau,depth"}, {}, "aovs asks for tau, depth: leave aovs out"),
-    "deterministic": ({"max_depth": 1, "deterministic": True}, {}, "deterministic is set: leave it out"),
-    "scattering": ({"max_depth": 3, "deterministic": True}, {"albedo": 0.5}, "deterministic is set: leave it out"),
     "rgb": ({"max_depth": 3}, {**fog([1.0, 0.5, 2.0]), "albedo": 0.5}, "the bounded field of fog is rgb: make it grey"),
     "emission": ({"max_depth": 1}, {**fog([1.0, 0.5, 2.0]), "emission": 0.5}, "the bounded field of fog is rgb: make it grey"),
 }
 
 
 @pytest.mark.parametrize("asked", REFUSED)
-def test_what_needs_an_exact_line_is_refused_by_name(asked: str) -> None:
+def test_colours_that_collide_are_refused_by_name(asked: str) -> None:
     settings, medium, sentence = REFUSED[asked]
     found = scene([0, -4, 0], [0, 0, 0], fog=shape("cube", {**fog(), **medium}))
-    with pytest.raises(MivolError, match=f"the medium in fog is a Ball, which is bounded .*{sentence}"):
+    with pytest.raises(MivolError, match=f"the medium in fog is a Ball, which is known at points only, .*{sentence}"):
         mi.render(found, integrator=mi.load_dict({"type": "mivol", **settings}), spp=1)
 
 

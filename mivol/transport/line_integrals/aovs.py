@@ -94,6 +94,7 @@ def integrate_aovs(media: SceneMedia, ray: Ray, names: tuple[str, ...], active: 
     """
     if not names:
         return []
+    media = media.by_quadrature()
     first = _find_first_segment(media, ray, active)
     rows = {"tau": first.tau, "alpha": first.alpha}
     values = {"depth": _integrate_depth(media, first, active)[0]} if "depth" in names else {}
@@ -108,6 +109,7 @@ def jvp_aovs(media: SceneMedia, ray: Ray, names: tuple[str, ...], active: mi.Boo
     """
     if not names:
         return []
+    media = media.by_quadrature()
     first = _find_first_segment(media, ray, active)
     rows, values = {}, {}
     if set(names) != {"depth"}:
@@ -129,6 +131,7 @@ def vjp_aovs(media: SceneMedia, ray: Ray, names: tuple[str, ...], daovs: list[mi
     """
     if not names:
         return
+    media = media.by_quadrature()
     first = _find_first_segment(media, ray, active)
     weight = [mi.Float(0) for _ in range(media.channels)]
     for name, d in zip(names, daovs, strict=True):

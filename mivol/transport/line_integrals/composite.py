@@ -33,7 +33,7 @@ from mivol.transport.media.compositing import (
     zeros,
 )
 from mivol.transport.media.gaussian_sweep import GaussianSweep
-from mivol.transport.media.grid_extinction import SummedExtinction
+from mivol.transport.media.grid_extinction import NodeValues, SummedExtinction
 from mivol.transport.media.ray_intervals import MediumInterval, find_boxed_intervals, trace_boundaries
 from mivol.transport.traversal.grid_walk import Cell, walk_cells
 from mivol.transport.traversal.interpolation import node_weights
@@ -285,7 +285,7 @@ class BodySweep:
         self.extinction = self.body.extinction(self.ray)
         self.tangent = None
         if tangent:
-            self.tangent = SummedExtinction(self.body.view.parts, self.body.tangents, mi.Float(1), linear=True)
+            self.tangent = SummedExtinction(self.body.view.parts, self.body.tangents, mi.Float(1), True, self.ray)
 
     # -- The sum and its tangent ---------------------------------------------------------------------------------------
 
@@ -338,7 +338,7 @@ class BodySweep:
         """
         integrand, layout, body = self.integrand, self.layout, self.body
         sweep = ReverseState(zeros(mi.Float, integrand.rows), [mi.Float64(a) for a in ahead], zeros(mi.Float, integrand.rows))
-        grids = [p for p in body.view.parts if p.lattice is not None]
+        grids = [p for p in body.view.parts if isinstance(p, NodeValues)]
         outside: list[tuple] = []
 
         def add_constant(sweep: ReverseState, a: mi.Float64, b: mi.Float64) -> ReverseState:
@@ -359,6 +359,9 @@ class BodySweep:
             by_point = [self.media.sum_channels([row[p] for row in slopes]) for p in range(len(corners))]
             for part in grids:
                 body.add_to_grid(part, cell.lower, list(zip(by_point, corners, strict=True)), on)
+            for part, _ in self.extinction.at_points:
+                for weights, t in zip(by_point, self._distances(cell), strict=True):
+                    body.vjp_extinction_at(self.ray, t, weights, on, part.name)
             return sweep
 
         if self._has_constants and layout.lattice is not None:
@@ -408,9 +411,14 @@ class BodySweep:
         """The points of a cell, as fractions from its near planes; the point nearest to the camera comes first."""
         return [dr.fma(cell.step, 1 - p, cell.frac) for p in self.integrand.points]
 
+    def _distances(self, cell: Cell) -> list[mi.Float]:
+        """The points of a cell as distances along the ray [length]."""
+        near = mi.Float(self.layout.leave - mi.Float64(cell.s + cell.dt))
+        return [dr.fma(cell.dt, p, near) for p in self.integrand.points]
+
     def _along(self, extinction: SummedExtinction, corners: list, cell: Cell) -> list[list[mi.Float]]:
         """[row][point] values of an extinction, or of its tangent, at the points of a cell."""
-        values = extinction.along(corners, self._points(cell))
+        values = extinction.along(corners, self._points(cell), self._distances(cell))
         points = [self._rows([row[p] for row in values]) for p in range(len(self.integrand.points))]
         return [list(row) for row in zip(*points, strict=True)]
 

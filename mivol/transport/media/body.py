@@ -11,6 +11,7 @@ References: Heitz et al. 2015, Eq. 6 (the projected area).
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from typing import Any
 
 import drjit as dr
@@ -97,6 +98,13 @@ class Body:
         """Whether some part has no known integral along a ray."""
         return len(self.exact_parts) < len(self.view.parts)
 
+    def by_quadrature(self) -> Body:
+        """The same medium, with gradients and tangents, whose bounded parts are integrated by quadrature."""
+        body = copy(self)
+        body.view = self.view.by_quadrature()
+        body.exact_parts, body.flight_parts = body.view.parts, flight_parts(body.view.parts)
+        return body
+
     def find_followed(self) -> None:
         """Find the parts, and whether the albedo, have derivatives enabled, so that only these are differentiated."""
         with dr.resume_grad():
@@ -145,7 +153,8 @@ class Body:
     def extinction(self, ray: Ray, parts: list[ExactExtinction] | None = None) -> SummedExtinction:
         """The sum along a ray of ``parts`` (by default all parts), whose grids share their cells; without derivatives."""
         parts = self.view.parts if parts is None else parts
-        return SummedExtinction(parts, [dr.detach(p.values) for p in parts], dr.detach(self.view.scale) * self.area(ray.d))
+        scale = dr.detach(self.view.scale) * self.area(ray.d)
+        return SummedExtinction(parts, [dr.detach(p.values) for p in parts], scale, ray=ray)
 
     def optical_depth(
         self,

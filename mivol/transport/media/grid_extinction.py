@@ -22,6 +22,7 @@ Conventions. Values are detached arrays; channels are 1 (grey) or 3 (rgb), and a
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -32,7 +33,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.activation import Activation
 from mivol.numerics import minimum
-from mivol.transport.media.extinction import ExactExtinction, RayInterval, Weight, weight_in_cell
+from mivol.transport.media.extinction import BoundedExtinction, ExactExtinction, RayInterval, Weight, weight_in_cell
 from mivol.transport.traversal.grid_walk import Cell, NodeArray, corner_nodes, read_nodes, walk_cells
 from mivol.transport.traversal.interpolation import (
     fraction_from_lower,
@@ -443,30 +444,43 @@ class SummedExtinction:
     """The sum of the parts of an extinction for each channel, in a cell of their grids and outside the grids.
 
     Args:
-        parts: constants, and grids that share their cells.
-        values: node values or constant of each part.
+        parts: constants, and grids and fields known at points that share their cells.
+        values: node values, constant or factor of each part.
         scale: factor on the sum.
         linear: whether the values are tangents, which skip the activation.
+        ray: the ray; needed for fields known at points.
     """
 
-    def __init__(self, parts: list[ExactExtinction], values: list, scale: mi.Float, linear: bool = False) -> None:
-        self.channels, self.scale = max(p.channels for p in parts), scale
+    def __init__(
+        self, parts: list[ExactExtinction], values: list, scale: mi.Float, linear: bool = False, ray: Ray | None = None
+    ) -> None:
+        self.channels, self.scale, self.ray, self.linear = max(p.channels for p in parts), scale, ray, linear
         pairs = list(zip(parts, values, strict=True))
-        self.activations = [None if linear else p.activation for p, _ in pairs if p.lattice is not None]
-        self.reads = [NodeArray(v, p.channels) for p, v in pairs if p.lattice is not None]
-        self.has_constants = len(self.reads) < len(parts)
+        self.at_points = [(p, v) for p, v in pairs if isinstance(p, BoundedExtinction)]
+        grids = [(p, v) for p, v in pairs if isinstance(p, NodeValues)]
+        self.activations = [None if linear else p.activation for p, _ in grids]
+        self.reads = [NodeArray(v, p.channels) for p, v in grids]
         constants = [_as_channels(v, p.channels) for p, v in pairs if p.is_constant]
+        self.has_constants = len(constants) > 0
         self.constant = [scale * sum((k[c % len(k)] for k in constants), mi.Float(0)) for c in range(self.channels)]
 
-    def along(self, corners: list, points: list[mi.Vector3f]) -> list[list[mi.Float]]:
-        """Values [channel][point] at points of a cell (fractions from its near planes), from [array][channel][corner]
-        values.
+    def along(self, corners: list, points: list[mi.Vector3f], distances: Sequence[mi.Float] = ()) -> list[list[mi.Float]]:
+        """Values [channel][point] at points of a cell, from [array][channel][corner] values.
+
+        Args:
+            corners: values at the corners of the cell.
+            points: fractions from the near planes of the cell.
+            distances: of the same points along the ray [length]; needed for fields known at points.
         """
         pairs = list(zip(corners, self.activations, strict=False))
-        grids = [[[activate(a, interpolate(g[c % len(g)], p)) for g, a in pairs] for p in points] for c in range(self.channels)]
-        return [
-            [dr.fma(self.scale, sum(s, mi.Float(0)), k) for s in sums] for sums, k in zip(grids, self.constant, strict=True)
-        ]
+        sums = [[[activate(a, interpolate(g[c % len(g)], p)) for g, a in pairs] for p in points] for c in range(self.channels)]
+        for part, value in self.at_points:
+            for k, t in enumerate(distances):
+                on = mi.Bool(True)
+                row = part.jvp_at(value, self.ray, t, on) if self.linear else part.eval_at(value, self.ray, t, on)
+                for c in range(self.channels):
+                    sums[c][k].append(row[c % len(row)])
+        return [[dr.fma(self.scale, sum(s, mi.Float(0)), k) for s in each] for each, k in zip(sums, self.constant, strict=True)]
 
     def slopes(self, corners: list, points: list[mi.Vector3f]) -> list[mi.Float] | None:
         """Slope of the activation at points of a cell; None without an activation. A radiance field is the only part of its

@@ -13,7 +13,7 @@ with their gradients.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -104,6 +104,10 @@ class MediumView:
     def channels(self) -> int:
         """1 if every part is grey, 3 if some part is rgb."""
         return max(part.channels for part in self.parts)
+
+    def by_quadrature(self) -> MediumView:
+        """The same medium, whose bounded parts are integrated by quadrature."""
+        return replace(self, parts=[p.by_quadrature() if isinstance(p, BoundedExtinction) else p for p in self.parts])
 
     @property
     def walked_lattice(self) -> Lattice | None:

@@ -82,6 +82,15 @@ class SceneMedia:
         media.has_surfaces = media.traces = False
         return media
 
+    def by_quadrature(self) -> SceneMedia:
+        """The same media, with their gradients and tangents, whose bounded parts are integrated by quadrature."""
+        if not self.is_bounded:
+            return self
+        media = copy(self)
+        media.__dict__.pop("alone", None)
+        media.boxed, media.traced = ([body.by_quadrature() for body in bodies] for bodies in (self.boxed, self.traced))
+        return media
+
     def find_blocked(self, ray: Ray, active: mi.Bool) -> mi.Bool:
         """Find the rays that meet a surface, if ``has_solid_surfaces``."""
         traced = to_mitsuba_ray(ray)

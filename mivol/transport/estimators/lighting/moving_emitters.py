@@ -18,7 +18,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.media.body import Body
-from mivol.transport.media.extinction import ExactExtinction, to_spectrum
+from mivol.transport.media.extinction import BoundedExtinction, ExactExtinction, RayInterval, to_spectrum
+from mivol.transport.media.optical_depth import segment_optical_depth
 from mivol.transport.media.ray_intervals import OWN_SURFACE, MediumInterval, RaySegment, revisit_media
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.box import UNIT_CUBE, map_point, map_vector
@@ -74,14 +75,16 @@ def optical_depth_gradient(
 
 
 def moving_transmittance(
-    media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], end: mi.Point3f, active: mi.Bool
+    media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float] | None, end: mi.Point3f, active: mi.Bool
 ) -> mi.Spectrum:
     """A factor of value 1 carrying the derivative of a shadow ray's transmittance by the position of its end.
 
-    The derivative of the factor is the derivative of log T = -tau, so T times the factor has the value and the derivative of T.
+    ``tau`` is the optical depth of the ray for each channel [1], or None if its transmittance was estimated. The derivative of
+    the factor is the derivative of log T = -tau, so T times the factor has the value and the derivative of T.
     """
-    moved = end - dr.detach(end)
+    moved, media = end - dr.detach(end), media.by_quadrature()
     with dr.suspend_grad():
+        tau = segment_optical_depth(media, ray_segment, active) if tau is None else tau
         slopes = optical_depth_gradient(media, ray_segment, tau, active)
     return to_spectrum([1 - dr.dot(s, moved) for s in slopes])
 
@@ -137,38 +140,52 @@ def _part_gradient(
     segment = clip_to_grid(lattice, ray.o, ray.d, t0, t1)
     a, b = mi.Float64(segment.t0), mi.Float64(segment.t0) + mi.Float64(segment.length)
     inside = on & (segment.length > 0)
-    vectors = _rotation_gradient(lattice, part, segment, inside)
-    high = tuple(n - 0.5 for n in lattice.res[::-1])
+    vectors = _rotation_gradient(lattice, part, ray, segment, inside)
+    rows, low, high = lattice.from_world, (-0.5,) * 3, tuple(n - 0.5 for n in lattice.res[::-1])
+    at_points = isinstance(part, BoundedExtinction)
+    if at_points:
+        rows, (low, high) = part.rows, UNIT_CUBE
+        a, b = map(mi.Float64, part.clip(RayInterval(ray, t0, t1, on)))
     leaves, enters = b < end * (1 - 1e-6), a > 0
     if body.box is None:
         # A traced boundary cutting the grid has its own terms; only faces of the grid inside the boundary count.
         leaves, enters = leaves & (b < t1 * (1 - 2 * SIDE_STEP)), enters & (a > t0 * (1 + 2 * SIDE_STEP))
     for t, sign, moves in ((b, -1.0, leaves), (a, 1.0, enters)):
         lanes = inside & moves
-        face = _face_direction(lattice.from_world, (-0.5,) * 3, high, ray, t)
+        face = _face_direction(rows, low, high, ray, t)
         if body.cuts_grids:
             # A boundary cutting the grid: the ray leaves (or enters) the medium through a face of the boundary.
             cut = dr.abs(t - (t1 if sign < 0 else t0)) <= 1e-6 * dr.abs(t)
             face = dr.select(cut, _boundary_direction(body, ray, t), face)
-        values = part.eval_at(1.0, ray, mi.Float(t), lanes)
+        # A field known at points is 0 in the face itself: it is read slightly inside.
+        at = t * (1 + sign * SIDE_STEP) if at_points else t
+        values = part.eval_at(mi.Float(1), ray, mi.Float(at), lanes)
         vectors = [v + dr.select(lanes, sign * mi.Float(t) * s * face, 0) for v, s in zip(vectors, values, strict=True)]
     return vectors
 
 
-def _rotation_gradient(lattice: Lattice, part: ExactExtinction, segment: Segment, active: mi.Bool) -> list[mi.Vector3f]:
+def _rotation_gradient(
+    lattice: Lattice, part: ExactExtinction, ray: Ray, segment: Segment, active: mi.Bool
+) -> list[mi.Vector3f]:
     """The integral of t grad(sigma) over a grid, one world vector for each channel."""
-    values = dr.detach(part.lattice.values.array)
+    at_points = isinstance(part, BoundedExtinction)
 
     def visit(total: list, cell: Cell, on: mi.Bool) -> list:
         half = dr.select(on, 0.5 * cell.dt, 0)
         for u, p in zip((GAUSS_POINT, 1 - GAUSS_POINT), gauss_points(cell), strict=True):
             t = segment.t0 + cell.s + u * cell.dt
-            slopes = [dr.select(cell.ahead, g, -g) for g in (_trilinear_gradient(c, p) for c in cell.corners[0])]
+            if at_points:
+                slopes = part.field.slopes(ray(t), ray.d, on)
+            else:
+                slopes = [dr.select(cell.ahead, g, -g) for g in (_trilinear_gradient(c, p) for c in cell.corners[0])]
             total = [v + (half * t) * g for v, g in zip(total, slopes, strict=True)]
         return total
 
     zero = [dr.zeros(mi.Vector3f, dr.width(segment.length)) for _ in range(part.channels)]
-    gradients = walk_cells(lattice, segment, visit, zero, [NodeArray(values, part.channels)], active)
+    reads = [] if at_points else [NodeArray(dr.detach(part.lattice.values.array), part.channels)]
+    gradients = walk_cells(lattice, segment, visit, zero, reads, active)
+    if at_points:
+        return gradients
     rows = [[mi.Float(v) for v in row[:3]] for row in lattice.from_world]
     return [mi.Vector3f(*(sum(rows[a][k] * g[a] for a in range(3)) for k in range(3))) for g in gradients]
 

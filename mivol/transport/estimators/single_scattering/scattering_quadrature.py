@@ -201,10 +201,12 @@ class _LitRay:
         hit = segment.length > 0
 
         def visit(state: _LightSum, cell: Cell, full: mi.Bool) -> _LightSum:
-            def sigma(x: mi.Float) -> list[mi.Float]:
-                return media.to_channels([v[0] for v in extinction.along(cell.corners, [dr.fma(cell.step, x, cell.frac)])])
-
             start = segment.start + mi.Float64(cell.s)
+
+            def sigma(x: mi.Float) -> list[mi.Float]:
+                point, t = dr.fma(cell.step, x, cell.frac), dr.fma(cell.dt, x, mi.Float(start))
+                return media.to_channels([v[0] for v in extinction.along(cell.corners, [point], [t])])
+
             span = _Span(start, cell.dt, sigma, source, self.equiangular, full & (cell.dt > 0))
             return _add_span(state, span, mi.Float(1))
 
