@@ -178,6 +178,9 @@ class HashSettings(Section):
     width: Annotated[int, setting("neuron", "neurons of a hidden layer; absent: preset", ge=1, le=256)] | None = None
     samples: Annotated[int, setting("sample", "samples of a step; absent: preset", ge=256, le=1 << 22)] | None = None
     cells: Annotated[int, setting("cell", "cells of the map of occupied space; absent: preset", ge=4, le=256)] | None = None
+    precision: (
+        Annotated[Literal["single", "half"], setting("1", "floats of the table that rays read; absent: preset")] | None
+    ) = None
 
     def __post_init__(self) -> None:
         if self.features not in (None, 1, 2, 4, 8):

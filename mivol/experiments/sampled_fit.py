@@ -15,6 +15,7 @@ from mivol.config import HashExperiment, NerfExperiment
 from mivol.errors import MivolError
 from mivol.experiments.field_fit import FieldFit, explain_wide_lenses, write_result
 from mivol.experiments.run_folder import RunFolder
+from mivol.fields.hash_grid import HashField
 from mivol.fields.sampled_field import SampledField
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.photographs.sampled_problem import PRESETS, SampledPlan, SampledProblem, check_memory
@@ -103,7 +104,18 @@ def make_sampled_plan(settings: HashExperiment | NerfExperiment) -> SampledPlan:
 
     sizes = replace(plan.sizes, **given(*(field.name for field in fields(plan.sizes))))
     steps = max(1, round(plan.steps * options.effort))
-    return replace(plan, sizes=sizes, steps=steps, **given("samples", "cells"))
+    return replace(plan, sizes=sizes, steps=steps, **given("samples", "cells", "precision"))
+
+
+def explain_table(plan: SampledPlan, box: np.ndarray) -> list[PlanLine]:
+    """Return the precision and the memory of the table of a hash grid; nothing of a NeRF."""
+    if plan.model is not HashField:
+        return []
+    numbers = plan.sizes.count_numbers(box[1] - box[0]) - plan.sizes.weights
+    half = plan.precision == "half"
+    size = numbers * (2 if half else 4) / 2**20
+    why = "the fit steps float32 values, and rounds them for rays" if half else 'field.precision = "half" takes half of it'
+    return [PlanLine(choice=f"{plan.precision} precision: rays read a table of {size:.1f} MiB", reason=why)]
 
 
 def explain_sampled_plan(plan: SampledPlan, photos: Photos, batches: RayBatches) -> list[PlanLine]:
@@ -127,6 +139,7 @@ def explain_sampled_plan(plan: SampledPlan, photos: Photos, batches: RayBatches)
     return [
         PlanLine(choice=f"{len(photos.views)} photographs, a box of {edges} [length]", reason=photos.survey.box_from),
         PlanLine(choice=model, reason=numbers),
+        *explain_table(plan, box),
         PlanLine(
             choice=f"{plan.samples} samples a step, about {most:.0f} a ray at first",
             reason=why,

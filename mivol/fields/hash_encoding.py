@@ -168,17 +168,18 @@ class HashEncoding:
         opaque = [[dr.opaque(mi.Float, float(v)) for v in row] for row in rows]
         return mi.Point3f(*(dr.fma(r[0], p.x, dr.fma(r[1], p.y, dr.fma(r[2], p.z, r[3]))) for r in opaque))
 
-    def encode(self, table: mi.Float, unit: mi.Point3f, active: mi.Bool = True) -> list[mi.Float]:
+    def encode(self, table: mi.Float | mi.Float16, unit: mi.Point3f, active: mi.Bool = True) -> list[mi.Float]:
         """Features of points of the unit cube; attached to the table."""
         width, features = self.sizes.features, []
+        packet = dr.replace_type_t(mi.ArrayXf, dr.type_v(table))
         for level in self.levels:
             sums = [mi.Float(0)] * width
             for row, weight in _corners(level, unit):
                 if width == 1:
-                    values = [dr.gather(mi.Float, table, row, active, mode=_reduce_mode())]
+                    values = [dr.gather(type(table), table, row, active, mode=_reduce_mode())]
                 else:
-                    values = dr.gather(mi.ArrayXf, table, row, active, mode=_reduce_mode(), shape=(width, 1))
-                sums = [dr.fma(values[k], weight, total) for k, total in enumerate(sums)]
+                    values = dr.gather(packet, table, row, active, mode=_reduce_mode(), shape=(width, 1))
+                sums = [dr.fma(mi.Float(values[k]), weight, total) for k, total in enumerate(sums)]
             features += sums
         return features
 

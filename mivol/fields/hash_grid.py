@@ -9,10 +9,13 @@ edge of the box, so an untrained field has an optical depth of about 1 across th
 
 Conventions. ``table`` is that of :mod:`mivol.fields.hash_encoding`; ``density_weights`` and ``colour_weights`` are arrays of
 :class:`mivol.fields.networks.Network`. On a CPU the networks multiply matrices of many points by BLAS, and the encoding has
-derivatives by hand; on a GPU Dr.Jit differentiates a kernel.
+derivatives by hand; on a GPU Dr.Jit differentiates the networks in a kernel.
 
-References: Müller, Evans, Schied, Keller 2022 (encoding, hash, activations, first values); Tancik et al. 2023 (truncated
-exponential).
+Half precision. Rays may read the table in half floats (11 bits, 2 bytes a number). A fit keeps its own float32 values, from
+which each step rounds the table. Derivatives by the table are float32 sums: so none underflows, and no loss is scaled.
+
+References: Müller, Evans, Schied, Keller 2022 (encoding, hash, activations, first values, half precision); Micikevicius et al.
+2018 (float32 values behind half ones); Tancik et al. 2023 (truncated exponential).
 """
 
 from __future__ import annotations
@@ -50,11 +53,12 @@ class HashField(SampledField):
     Attributes:
         sizes: of grid and networks.
         to_world: (4, 4) float64, unit cube to world.
-        table: Float, features, [row][feature].
+        table: Float (or Float16), features, [row][feature].
         density_weights, colour_weights: Float, weights of the networks.
         space: "srgb" or "linear", of the colours.
         region: cells in which the field is not 0; None before a fit.
         white: factor on the colours.
+        precision: "single" or "half", of the table that rays read.
     """
 
     kind: ClassVar[str] = "hash"
@@ -70,8 +74,11 @@ class HashField(SampledField):
     space: str = "srgb"
     region: Region | None = None
     white: float = 1.0
+    precision: str = "single"
 
     def __post_init__(self) -> None:
+        if self.precision == "half":
+            object.__setattr__(self, "table", mi.Float16(self.table))
         self.check()
 
     def __repr__(self) -> str:
@@ -132,13 +139,18 @@ class HashField(SampledField):
     def eval(self, p: mi.Point3f, d: mi.Vector3f, active: mi.Bool = True) -> tuple[mi.Float, mi.Color3f]:
         """Extinction and colour at points in the lanes of a kernel; attached to the parameters."""
         geometry = self._lane_geometry(p, active)
-        inputs = [*geometry, *dr.sh_eval(d, self.sizes.degree)]
-        raw = Network.eval_lanes(self.sizes.colour_network.pack(self.colour_weights), inputs)
-        return self._lane_density(geometry), colour_lanes(raw, self.space, self.white)
+        return self._lane_density(geometry), self._lane_colour(geometry, d)
 
     def _lane_geometry(self, p: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
-        layers = self.sizes.density_network.pack(self.density_weights)
-        return Network.eval_lanes(layers, self.encoding.encode(self.table, self.encoding.to_unit(p), active))
+        return self._lane_network(self.encoding.encode(self.table, self.encoding.to_unit(p), active))
+
+    def _lane_network(self, features: list[mi.Float]) -> list[mi.Float]:
+        return Network.eval_lanes(self.sizes.density_network.pack(self.density_weights), features)
+
+    def _lane_colour(self, geometry: list[mi.Float], d: mi.Vector3f) -> mi.Color3f:
+        inputs = [*geometry, *dr.sh_eval(d, self.sizes.degree)]
+        raw = Network.eval_lanes(self.sizes.colour_network.pack(self.colour_weights), inputs)
+        return colour_lanes(raw, self.space, self.white)
 
     def _lane_density(self, geometry: list[mi.Float]) -> mi.Float:
         return self.scale * dr.exp(cut_exponent(geometry[0]))
@@ -161,6 +173,24 @@ class HashField(SampledField):
 
     def evaluate(self, p: mi.Point3f, d: mi.Vector3f) -> PointValues:
         return self._evaluate_rows(p, d) if has_blas() else self._evaluate_lanes(p, d)
+
+    def _evaluate_lanes(self, p: mi.Point3f, d: mi.Vector3f) -> PointValues:
+        """Values by a kernel. Dr.Jit differentiates the networks, the encoding has its own derivatives."""
+        unit, weights = self.encoding.to_unit(p), ("density_weights", "colour_weights")
+        features = dr.detach(self.encoding.encode(self.table, unit))
+        attached = self.with_parameters(self.parameters())
+        arrays = {name: getattr(attached, name) for name in weights}
+        dr.enable_grad(features, arrays)
+        geometry = attached._lane_network(features)
+        sigma, colour = attached._lane_density(geometry), attached._lane_colour(geometry, d)
+
+        def vjp(dsigma: mi.Float, dcolour: mi.Color3f) -> dict[str, mi.Float]:
+            dr.backward_from(sigma * dsigma + dr.dot(colour, dcolour))
+            target = dr.zeros(mi.Float, dr.width(self.table))
+            self.encoding.add_features(unit, dr.grad(features), target)
+            return {"table": target} | {name: dr.grad(array) for name, array in arrays.items()}
+
+        return PointValues(dr.detach(sigma), dr.detach(colour), vjp)
 
     def _evaluate_rows(self, p: mi.Point3f, d: mi.Vector3f) -> PointValues:
         """Values by products of matrices; the adjoint computes the hidden layers again, block by block."""

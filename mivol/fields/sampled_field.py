@@ -190,7 +190,7 @@ class SampledField(ABC):
 
     def parameters(self) -> dict[str, mi.TensorXf]:
         """Values by name."""
-        return {name: mi.TensorXf(getattr(self, name), shape) for name, shape in self.shapes().items()}
+        return {name: mi.TensorXf(mi.Float(getattr(self, name)), shape) for name, shape in self.shapes().items()}
 
     def with_parameters(self, values: dict[str, mi.TensorXf]) -> Self:
         """The field with other values of the same shapes."""

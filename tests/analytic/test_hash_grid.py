@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -123,6 +125,30 @@ def test_both_evaluations_agree_beyond_the_cut_of_exponents(variant_rgb: str, sp
         expected = np.array(by_lanes[name], np.float64)
         # Exponents of up to 15 in float32 sums of terms up to 1000: 1e-4 of the largest value. Logistic functions saturate.
         np.testing.assert_allclose(np.array(slopes, np.float64), expected, atol=1e-3 * np.abs(expected).max() + 1e-20)
+
+
+@pytest.mark.parametrize("which", ["_evaluate_rows", "_evaluate_lanes"])
+def test_a_table_in_half_floats_is_the_rounded_table(variant_rgb: str, which: str) -> None:
+    """Values and derivatives are those of single precision at the rounded numbers, to the bit; derivatives are float32."""
+    single = make()
+    half = replace(single, precision="half")
+    table = np.array(single.table)
+    rounded = single.with_parameters(
+        single.parameters() | {"table": mi.TensorXf(np.float32(np.float16(table)), single.shapes()["table"])}
+    )
+    assert half.table.numpy().nbytes * 2 == table.nbytes
+    # 11 bits, to nearest; below 2^-14 the spacing is 2^-24.
+    assert (np.abs(np.array(rounded.table) - table) <= np.maximum(2.0**-11 * np.abs(table), 2.0**-25)).all()
+    p, d = random_points(500)
+    by_sigma, by_colour = mi.Float(np.linspace(-1, 1, 500)), mi.Color3f(*np.random.default_rng(2).normal(size=(3, 500)))
+    found, expected = (getattr(field, which)(p, d) for field in (half, rounded))
+    assert np.array_equal(np.array(found.sigma), np.array(expected.sigma))
+    assert np.array_equal(np.array(found.colour), np.array(expected.colour))
+    assert not np.array_equal(np.array(found.sigma), np.array(getattr(single, which)(p, d).sigma))
+    slopes, others = (values.vjp(by_sigma, by_colour) for values in (found, expected))
+    for name, slope in slopes.items():
+        assert type(slope) is mi.Float
+        np.testing.assert_array_equal(np.array(slope), np.array(others[name]))
 
 
 def test_blocks_in_threads_give_the_same_bits(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:

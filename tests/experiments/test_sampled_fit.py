@@ -45,7 +45,13 @@ def photographs(alpha: object) -> SimpleNamespace:
             {
                 "4 levels of 16 to 64 cells, 2 features each": "numbers in at most 8192 rows a level, and",
                 "8192 samples a step, about 20 a ray at first": "2 along a cell of the map of occupied space, 10 cells an edge",
+                "single precision: rays read a table of 0.2 MiB": 'field.precision = "half" takes half of it',
             },
+        ),
+        (
+            "hash",
+            {"levels": 4, "cells": 10, "precision": "half"},
+            {"half precision: rays read a table of 0.1 MiB": "the fit steps float32 values, and rounds them for rays"},
         ),
         (
             "nerf",

@@ -82,6 +82,23 @@ def test_a_resumed_fit_equals_an_uninterrupted_fit(one_thread, photos: list[Phot
     assert resumed.problem.samples_a_ray == whole.problem.samples_a_ray
 
 
+def test_half_precision_rounds_what_rays_read_and_keeps_what_a_fit_steps(variant_rgb: str, photos: list[Photo]) -> None:
+    """Loss and gradient are those of single precision at the rounded table; steps below its rounding are not lost."""
+    half = SampledProblem(RayBatches.from_photos(photos[:4]), BOX, replace(PLAN, precision="half"), seed=1)
+    single = SampledProblem(RayBatches.from_photos(photos[:4]), BOX, PLAN, seed=1)
+    reals = half.values() | {"table": mi.TensorXf(np.random.default_rng(0).normal(size=half.values()["table"].shape))}
+    rounded = reals | {"table": mi.TensorXf(np.float32(np.float16(np.array(reals["table"]))))}
+    found, expected = half.loss_and_gradient(reals, 1), single.loss_and_gradient(rounded, 1)
+    assert float(found[0][0]) == float(expected[0][0])
+    for name, value in expected[1].items():
+        np.testing.assert_array_equal(np.array(found[1][name]), np.array(value))
+    fit = begin(photos[:4], replace(PLAN, precision="half", rate=1e-9))
+    before = np.array(fit.run.reals["table"])
+    table = np.array(taken(fit, 8).run.reals["table"])
+    changed = table != before  # by 8e-9 at most, of numbers of up to 1e-4, between which half floats lie 6e-8 apart
+    assert changed.any() and (np.float16(table) == np.float16(before))[changed].mean() > 0.5
+
+
 def test_rates_rise_and_fall_as_published() -> None:
     plan = SampledPlan(steps=1000)
     rates = [plan.learning_rate(step) for step in (0, 50, 100, 499, 500, 750, 900)]

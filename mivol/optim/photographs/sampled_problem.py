@@ -64,6 +64,7 @@ class SampledPlan:
         refresh_all: first steps, in which a refresh evaluates all cells; later ones evaluate a fourth at random and a fourth
             among the occupied.
         random_background: whether photographs with alpha get another background colour in each step.
+        precision: "single" or "half", of the table of a hash grid that rays read.
     """
 
     sizes: FieldSizes = dataclasses.field(default_factory=HashSizes)
@@ -83,6 +84,7 @@ class SampledPlan:
     refresh_every: int = 16
     refresh_all: int = 256
     random_background: bool = True
+    precision: str = "single"
 
     @property
     def optimizer(self) -> Adam:
@@ -114,10 +116,12 @@ HASH_GRIDS: dict[str, SampledPlan] = {
     "tiny": SampledPlan(HashSizes(levels=6, log2_table=13, finest=64, width=16), steps=200, samples=1 << 13, cells=24),
     "minute": SampledPlan(HashSizes(log2_table=18, finest=512), cells=96),
     "minutes": SampledPlan(HashSizes(log2_table=18, finest=512), steps=5000, cells=96),
-    "gpu": SampledPlan(HashSizes(log2_table=19, finest=2048, features=4, width=64), steps=20000, samples=1 << 18, cells=128),
+    "gpu": SampledPlan(
+        HashSizes(log2_table=19, finest=2048, features=4, width=64), steps=20000, samples=1 << 18, cells=128, precision="half"
+    ),
 }
-"""``tiny`` takes seconds, ``minute`` a minute on two cores, ``minutes`` five. ``gpu`` has the sizes of Müller et al. (not
-measured)."""
+"""``tiny`` takes seconds, ``minute`` a minute on two cores, ``minutes`` five. ``gpu`` has the sizes and the precision of Müller
+et al. (not measured)."""
 
 NERF = SampledPlan(NerfSizes(), NerfField, rate=5e-4, decay=1.0, fall=0.1, memory=0.999, weight_decay=0.0)
 """Published sizes, rate and decay (Mildenhall et al. 2020): a tenth of the rate at the end."""
@@ -173,6 +177,8 @@ class SampledProblem(DividedProblem):
         to_world = np.diag([*(self.box[1] - self.box[0]), 1.0])
         to_world[:3, 3] = self.box[0]
         self.field = self.plan.model.random(self.plan.sizes, to_world, self.seed, self.batches.space)
+        if self.plan.precision != "single":
+            self.field = replace(self.field, precision=self.plan.precision)
         self.scale = SCALES[self.batches.space]
         res, place = place_grid(self.box, self.plan.cells)
         self.step = float(place[0, 0] / res[2]) / self.plan.samples_a_cell
@@ -341,11 +347,13 @@ SAMPLE = 4 * 160
 
 
 def estimate_bytes(plan: SampledPlan, box: np.ndarray) -> int:
-    """Dr.Jit's memory in a step [bytes]: parameters with two moments, derivatives and one copy per thread; map; samples."""
+    """Dr.Jit's memory in a step [bytes]: parameters with two moments, derivatives and one copy per thread, perhaps a table in
+    half floats; map; samples."""
     threads = dr.thread_count() if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else 0
     table = allocated_bytes(4 * plan.sizes.count_numbers(box[1] - box[0]))
     cells = math.prod(n + 1 for n in place_grid(box, plan.cells)[0])
-    return (8 + threads) * table + 40 * cells + SAMPLE * 4 * plan.samples
+    tables = 8 + threads + (0.5 if plan.precision == "half" else 0)
+    return round(tables * table) + 40 * cells + SAMPLE * 4 * plan.samples
 
 
 def check_memory(plan: SampledPlan, box: np.ndarray, batches: RayBatches, limit: int | None = None) -> str:
