@@ -315,6 +315,11 @@ class ConeBeam(_TurningDetector):
                 f"Found {self.source_to_axis} from source to axis and {self.source_to_detector} from source to "
                 "detector, expected positive lengths."
             )
+        if self.source_to_detector < self.source_to_axis:
+            raise MivolError(
+                f"Found the detector {self.source_to_detector} from the source, in front of the axis at {self.source_to_axis}: "
+                "swap source_to_axis and source_to_detector, or give the distance from the source, not from the axis."
+            )
         _check_detector(self)
 
     def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

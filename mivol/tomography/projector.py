@@ -176,7 +176,7 @@ class Projector:
 
     def subset(self, views: Sequence[int] | np.ndarray) -> Projector:
         """Select the rows of some views, counted among this projector's own. Compiles nothing."""
-        return Projector(self.geometry, self.grid, self.views[np.asarray(views, int)], self._kernels)
+        return Projector(self.geometry, self.grid, self.views[view_index(views, self.n_views)], self._kernels)
 
     @cached_property
     def column_sums(self) -> np.ndarray:

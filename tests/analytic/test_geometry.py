@@ -127,6 +127,8 @@ def cone(**change: object) -> ConeBeam:
             for x in (0, -1, np.inf, np.nan, "a", None, [1, 2])
         ],
         *[(lambda x=x: cone(source_to_detector=x), "expected positive lengths") for x in (0, -1, np.inf, np.nan)],
+        (lambda: cone(source_to_axis=2.0, source_to_detector=1.0), "swap source_to_axis and source_to_detector"),
+        (lambda: Projector(cone(angles=[0.0, 1.0]), VoxelGrid((1, 1, 1))).subset([0, 2]), "view 2, expected views from 0 to 1"),
         *[(lambda x=x: cone(pitch=x), "pixel pitch") for x in (0, (1, -1), (0, 1), np.inf, np.nan, "a", (1, 1, 1))],
         *[(lambda x=x: cone(angles=x), "view angles") for x in ([], [np.nan], [0, np.inf], None, "a")],
         *[
