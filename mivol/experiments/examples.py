@@ -144,7 +144,7 @@ SCAN_FILES = {"scan.file": "panels.txt", "data.file": "readings.npy", "data.flat
 
 EXAMPLES: dict[str, Example] = {
     "demo": Example("a tangle of absorbing matter from 16 pictures, about a minute"),
-    "bonsai": Example("a bonsai from readings of a simulated cone-beam scan, its geometry a table", scan="scan.py"),
+    "bonsai": Example("a bonsai from a simulated cone-beam scan, with the geometry of its views in a table", scan="scan.py"),
     "shepp_logan": Example("the head phantom of Shepp and Logan from cone-beam projections"),
     "still_life": Example("glossy and matt things from photographs, as a radiance field", photographs="photographs.py"),
     "gaussians": Example(

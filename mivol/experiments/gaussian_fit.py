@@ -29,7 +29,7 @@ from mivol.optim.gaussians.density_control import CloudArrays
 from mivol.optim.gaussians.gaussian_plan import CONTROLS, PRESETS, GaussianPlan, check_memory, scene_extent
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.optim.photographs.radiance_plan import FEW_PHOTOGRAPHS
-from mivol.optim.photographs.ray_batches import RayBatches
+from mivol.optim.photographs.ray_batches import RayBatches, describe_size
 from mivol.optim.strategy import suggest_name
 from mivol.photos import Camera, Photo, Photos, project, rays, rectify
 from mivol.photos.exposures import Exposures, measure_exposures
@@ -250,7 +250,7 @@ def explain_plan(
     exposures: Exposures | None,
 ) -> list[PlanLine]:
     """Return the choices of the plan with their reasons."""
-    stages = [f"{stage.steps} of photographs shrunk by {stage.shrink}, degree {stage.degree}" for stage in plan.stages]
+    stages = [f"{stage.steps} of {describe_size(stage.shrink)}, degree {stage.degree}" for stage in plan.stages]
     behind = "alpha marks the object" if photos.views[0].alpha is not None else "photos.background"
     background = PlanLine(choice="no Gaussians for the background", reason=behind)
     if plan.reach:
@@ -261,7 +261,7 @@ def explain_plan(
     }[plan.control]
     views = "one photograph" if plan.views == 1 else f"{plan.views} photographs"
     return [
-        PlanLine(choice=f"{len(photos.views)} photographs", reason=photos.survey.box_from),
+        PlanLine(choice=f"{len(photos.views)} photographs", reason=f"their box: {photos.survey.box_from}"),
         PlanLine(choice=f"{count} Gaussians at first", reason=whence),
         PlanLine(choice=f"up to {max(plan.most, count)} Gaussians", reason=control),
         PlanLine(choice=f"{plan.steps} steps: {'; '.join(stages)}", reason=f"small photographs first, {views} a step"),

@@ -34,7 +34,7 @@ from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.octree_building import OctreeRecipe, build_octree, build_octree_of_points
 from mivol.optim.photographs.octree_problem import LeafPlan, OctreePlan, OctreeProblem
 from mivol.optim.photographs.radiance_plan import PRESETS, RadiancePlan
-from mivol.optim.photographs.ray_batches import RayBatches
+from mivol.optim.photographs.ray_batches import RayBatches, describe_size
 from mivol.optim.photographs.sampled_problem import PRESETS as PRESETS_OF_NETWORKS
 from mivol.optim.photographs.sampled_problem import SampledPlan
 from mivol.photos import Photos
@@ -93,7 +93,7 @@ class OctreeFit(FieldFit):
         self.plan, grid, self.batches = adapt_octree_plan(self.plan, find_preset(self.settings.field), self.photos)
         leaves = self.plan.leaves
         steps = PlanLine(
-            choice=f"{leaves.steps} steps of the octree, photographs shrunk by {leaves.shrink}",
+            choice=f"{leaves.steps} steps of the octree, {describe_size(leaves.shrink)}",
             reason=f"field.steps times field.effort; the leaves stay in place; about {leaves.minutes:.2g} minutes more",
         )
         size = "half a voxel" if not self.plan.recipe.depth else f"a cube's edge over 2^{self.plan.recipe.depth}"

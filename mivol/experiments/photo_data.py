@@ -176,8 +176,8 @@ def describe_photos(photos: Photos, judged: Photos | None = None) -> list[str]:
     if judged is not None:
         width, height = judged.views[0].camera.size
         notes.append(
-            f"{len(judged.views)} views are judged, the first at {width} x {height} pixels; PSNR is the mean over them, of "
-            "sRGB codes of 8 bits, with the peak 1."
+            f"PSNR is the mean over the {len(judged.views)} judged views (the first has {width} x {height} pixels), of 8-bit "
+            "sRGB codes with the peak 1."
         )
     notes += [f"{note[:1].upper()}{note[1:]}." for note in photos.survey.notes]
     if photos.skipped:

@@ -358,9 +358,12 @@ def _plan_gradient_memory(needs: Needs) -> tuple[int, Choice]:
             f"a gradient step would take {memory / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free; lower the resolution "
             f"of the grids: {edge} % of their nodes along each axis fit."
         )
-    parameters = ", ".join(needs.parameters) or "none with gradients yet"
     size = f"{memory / 2**20:.1f} MiB besides the rays ({'; '.join(sorted(ways)) or 'no grid'})"
-    return memory, Choice("gradient step", size, f"parameters: {parameters}")
+    return memory, Choice(
+        "gradient step",
+        size,
+        f"images are differentiated by {', '.join(needs.parameters)}" if needs.parameters else "no parameter has gradients yet",
+    )
 
 
 Readings = list[list[PartReading]]

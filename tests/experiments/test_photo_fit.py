@@ -479,7 +479,7 @@ def test_each_look_is_at_the_same_views(photographs: Path, tmp_path: Path, monke
     assert one == {"few_psnr": alone[0]}
     assert both == {"held_out_psnr": np.mean(alone)}
     assert judge_few(None) == {}
-    assert any("2 views are judged, the first at 48 x 48 pixels" in note for note in photo_data.describe_photos(judged, judged))
+    assert any("over the 2 judged views (the first has 48 x 48" in note for note in photo_data.describe_photos(judged, judged))
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,7 @@ def test_memory_is_described_and_checked(variant_rgb: str) -> None:
     """What is needed is what is there, to the byte; what fits is what would be taken."""
     pictures, pixels = 3 << 20, 10_000
     needed = pictures + estimate_bytes(PLAN, 900, pixels)
-    said = f"about {needed / 2**20:.0f} MiB: photographs 3, Gaussians and an image the rest"
+    said = f"about {needed / 2**20:.0f} MiB: 3 for photographs, the rest for Gaussians and an image"
     assert check_memory(PLAN, pictures, pixels, needed) == check_memory(PLAN, pictures, pixels) == said
     assert check_memory(replace(PLAN, start=900, most=1), pictures, pixels, needed) == said
     wanted = "a fit of 900 Gaussians needs 0.0 GiB of memory and 0.0 GiB are free: gaussians.most = 899 fits."

@@ -290,4 +290,4 @@ def check_memory(plan: GaussianPlan, photographs: int, pixels: int, limit: int |
         return f"gaussians.most = {rest // each:.0f} fits" if rest > each else "read the photographs smaller (photos.scale)"
 
     back_end.check_memory(needed, f"a fit of {most} Gaussians", advise, limit)
-    return f"about {needed / 2**20:.0f} MiB: photographs {photographs / 2**20:.0f}, Gaussians and an image the rest"
+    return f"about {needed / 2**20:.0f} MiB: {photographs / 2**20:.0f} for photographs, the rest for Gaussians and an image"

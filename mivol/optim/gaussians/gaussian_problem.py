@@ -33,7 +33,7 @@ from mivol.optim.gaussians.density_control import (
 from mivol.optim.gaussians.gaussian_plan import CONTROLS, GaussianPlan, scene_extent
 from mivol.optim.losses import ImageShape, image_loss
 from mivol.optim.photographs.photo_colours import Exposure, pull_at
-from mivol.optim.photographs.ray_batches import RayBatches
+from mivol.optim.photographs.ray_batches import RayBatches, describe_size
 from mivol.optim.problem import Divide, DividedProblem, Reals, Refinement, StagedProblem, add_parts, to_arrays, to_tensors
 from mivol.optim.strategy import suggest_name
 from mivol.photos import Camera
@@ -429,7 +429,7 @@ class GaussianProblem(StagedProblem, DividedProblem):
             learnt = _with_degree({name: np.array(value) for name, value in tensors.items()}, now.degree)
             return {name: mi.TensorXf(array) for name, array in learnt.items()}
 
-        message = f"photographs shrunk by {now.shrink}, harmonics of degree {now.degree}"
+        message = f"{describe_size(now.shrink)}, harmonics of degree {now.degree}"
         return Refinement(self.initial_reals(), carry, {}, message)
 
     # -- On disk ------------------------------------------------------------------------------------------------------

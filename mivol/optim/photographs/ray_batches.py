@@ -374,6 +374,11 @@ def _pixels(photo: Photo, with_alpha: bool, space: str) -> np.ndarray:
     return np.concatenate([image, photo.alpha[..., None]], axis=2) if with_alpha else image
 
 
+def describe_size(shrink: int) -> str:
+    """Describe photographs whose edges are divided by ``shrink``."""
+    return "whole photographs" if shrink == 1 else f"photographs shrunk by {shrink}"
+
+
 def _shrunk(image: np.ndarray, shrink: int) -> np.ndarray:
     """Means over squares of pixels; incomplete squares at the border are dropped, so the camera stays the same."""
     height, width = (n // shrink * shrink for n in image.shape[:2])
