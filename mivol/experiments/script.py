@@ -34,6 +34,7 @@ from mivol.optim.scenes.views import View
 from mivol.points import Gaussians, read_gaussians
 from mivol.scene.explain import describe_light, explain_scene
 from mivol.scene.load import SceneSource, load_scene
+from mivol.scene.sensors import find_sensor
 
 Reference: TypeAlias = "np.ndarray | mi.TensorXf | str | os.PathLike[str]"
 """An image: an array (height, width, channels) of linear radiance, or an OpenEXR file."""
@@ -51,7 +52,7 @@ class Problem(SceneProblem):
             channels).
         integrator: an integrator with derivatives; None means the scene's integrator if from mivol, otherwise mivol's
             integrator with the same depth.
-        sensors: sensors of the images; None means the scene's own sensors.
+        sensors: sensors of the images, or their numbers in the scene; None means the scene's own sensors.
         spp: samples per pixel of an image, and of its derivative.
         seed: root of all random numbers.
 
@@ -72,15 +73,31 @@ class Problem(SceneProblem):
         *,
         loss: Loss | Callable[[mi.TensorXf, mi.TensorXf], mi.Float | mi.TensorXf] = L2(),  # noqa: B008  (frozen)
         integrator: mi.Integrator | None = None,
-        sensors: Sequence[mi.Sensor] | None = None,
+        sensors: Sequence[int | mi.Sensor] | None = None,
         spp: int = 16,
         seed: int = 0,
     ) -> None:
+        check_whole("spp", spp, 1)
+        check_whole("seed", seed, 0)
+        if not isinstance(integrator, mi.Integrator | None):
+            raise MivolError(
+                f"integrator: found {type(integrator).__name__}, expected an integrator: write mi.load_dict({{...}}) around it."
+            )
         loaded = load_scene(scene).scene
-        image_sensors = list(loaded.sensors() if sensors is None else sensors)
+        image_sensors = [find_sensor(loaded, one) for one in (loaded.sensors() if sensors is None else sensors)]
         fit_parameters = make_parameters(parameters)
         views = make_views(references, image_sensors)
         super().__init__(loaded, views, fit_parameters, integrator or choose_own_integrator(loaded), loss, spp, seed=seed)
+
+
+def check_whole(name: str, value: int, least: int) -> None:
+    """Refuse what is no whole number, and numbers below the least.
+
+    Raises:
+        MivolError: with the name and the value.
+    """
+    if not isinstance(value, int | np.integer) or value < least:
+        raise MivolError(f"found {value!r} as {name}, expected a whole number from {least} on.")
 
 
 def choose_own_integrator(scene: mi.Scene) -> mi.Integrator:
@@ -179,13 +196,14 @@ def optimize(
         The fit: ``fit.values()`` has the parameters, ``fit.history`` the losses.
 
     Raises:
-        MivolError: no problem, a loss that is not finite, or a scene that cannot be rendered.
+        MivolError: no problem, settings outside their domains, a loss that is not finite, or a scene that cannot be rendered.
         KeyboardInterrupt: Ctrl-C; the scene holds the newest parameters.
     """
     if not hasattr(problem, "initial_reals"):
         raise MivolError(
             f"found {type(problem).__name__}, expected a problem; write mivol.Problem(scene, references, parameters)."
         )
+    check_whole("iterations", iterations, 0)
     # An optimizer of mi.ad has a length, and is false before it has parameters.
     chosen = Adam() if optimizer is None else to_optimizer(optimizer)
     return reconstruct(problem, chosen, iterations, measure=measure, observer=observer)
@@ -209,11 +227,8 @@ def explain(
     Raises:
         MivolError: a ``max_depth`` that is no whole number from -1 on; otherwise as :func:`mivol.scene.load.load_scene`.
     """
-    if max_depth is not None and (not isinstance(max_depth, int) or max_depth < -1):
-        raise MivolError(
-            f"found {max_depth!r} as max_depth, expected a whole number from -1 on; leave it out to take the depth of the "
-            "scene's own integrator."
-        )
+    if max_depth is not None:
+        check_whole("max_depth", max_depth, -1)
     loaded = scene if isinstance(scene, mi.Scene) else load_scene(scene).scene
     return explain_scene(loaded, max_depth, sensor, noise).text
 

@@ -28,7 +28,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.optim.strategy import Strategy, make_table, setting
+from mivol.optim.strategy import Strategy, check_strategy, make_table, setting
 
 
 class Loss(Strategy, tag="loss"):
@@ -210,10 +210,10 @@ def to_loss(given: Loss | Callable[[mi.TensorXf, mi.TensorXf], Any]) -> Loss:
     """A loss of mivol unchanged; another function of two images as a loss.
 
     Raises:
-        MivolError: the object cannot be called.
+        MivolError: the object cannot be called, or as :func:`mivol.optim.strategy.check_strategy`.
     """
-    if isinstance(given, Loss):
-        return given
+    if isinstance(given, type | Loss):
+        return check_strategy(given)
     if not callable(given):
         raise MivolError(f"found {type(given).__name__}, expected a loss of mivol or a function of image and reference.")
     return FunctionLoss(function=given)

@@ -13,7 +13,7 @@ from mivol.optim.first_order import Adam, RMSprop
 from mivol.optim.optimizer import Optimizer, OptimizerRun
 from mivol.optim.problem import DifferentiableProblem
 from mivol.optim.second_order import GaussNewton, Lbfgs
-from mivol.optim.strategy import make_table
+from mivol.optim.strategy import check_strategy, make_table
 
 OPTIMIZERS = make_table(Adam, RMSprop, Lbfgs, GaussNewton)
 """Optimizers available in files."""
@@ -70,10 +70,10 @@ def to_optimizer(given: Optimizer | mi.ad.Optimizer) -> Optimizer:
     """An optimizer of mivol unchanged; an optimizer of ``mi.ad`` in its adapter.
 
     Raises:
-        MivolError: an object of another type, or a class in place of an object.
+        MivolError: an object of another type, or as :func:`mivol.optim.strategy.check_strategy`.
     """
-    if isinstance(given, type):
-        raise MivolError(f"found the class {given.__name__}, expected an optimizer object: write {given.__name__}(...).")
+    if isinstance(given, type | Optimizer):
+        return check_strategy(given)
     if hasattr(given, "begin"):
         return given
     if not isinstance(given, mi.ad.Optimizer):

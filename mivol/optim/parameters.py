@@ -18,7 +18,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.optim.priors import Prior
-from mivol.optim.strategy import suggest_name
+from mivol.optim.strategy import check_strategy, suggest_name
 
 ADDRESS = r"^object_\d+"
 """The name that Mitsuba gives an object without an id: its address in memory, another one in each run."""
@@ -185,6 +185,10 @@ class Parameter:
             )
         if not self.lr > 0.0:
             raise MivolError(f"{self.name}: learning rate {self.lr} is not positive: give a step size above 0.")
+        if not isinstance(self.priors, Sequence) or not all(isinstance(prior, Prior) for prior in self.priors):
+            raise MivolError(f"{self.name}: found the priors {self.priors!r:.80}, expected a list of priors.")
+        for prior in self.priors:
+            check_strategy(prior)
 
     def to_reals(self, value: mi.TensorXf) -> mi.TensorXf:
         """Reals of a value.

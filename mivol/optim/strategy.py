@@ -70,3 +70,19 @@ def choose(strategies: dict[str, type[S]], name: str, kind: str, **settings: Any
         return msgspec.convert({**settings, "name": name}, strategies[name])
     except msgspec.ValidationError as error:
         raise MivolError(f'{kind} "{name}": {error}.') from None
+
+
+def check_strategy(given: S) -> S:
+    """Return a strategy that was made in Python, where msgspec checks no values.
+
+    Raises:
+        MivolError: a class in place of an object, or a value outside its domain.
+    """
+    if isinstance(given, type):
+        raise MivolError(f"found the class {given.__name__}, expected an object: write {given.__name__}(...).")
+    kind = type(given)
+    try:
+        msgspec.convert({**msgspec.structs.asdict(given), "name": kind.label()}, kind)
+    except msgspec.ValidationError as error:
+        raise MivolError(f"{kind.__name__}: {error}.") from None
+    return given

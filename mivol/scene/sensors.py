@@ -44,10 +44,12 @@ def find_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
     """Find a sensor of the scene by number; a given sensor is returned unchanged.
 
     Raises:
-        MivolError: no sensor with the number.
+        MivolError: no sensor with the number, or an object of another type.
     """
-    if not isinstance(sensor, int):
+    if isinstance(sensor, mi.Sensor):
         return sensor
+    if not isinstance(sensor, int | np.integer):
+        raise MivolError(f"found {type(sensor).__name__}, expected a sensor or its number in the scene, from 0 on.")
     sensors = scene.sensors()
     if not 0 <= sensor < len(sensors):
         raise MivolError(f"the scene has no sensor {sensor}, only {len(sensors)} of them; count from 0, or add one.")

@@ -19,7 +19,8 @@ import mivol
 from mivol.errors import MivolError
 from mivol.experiments.script import Problem, optimize
 from mivol.files import encode_srgb, read_exr, write_exr
-from mivol.optim.losses import L2
+from mivol.optim.losses import L2, Huber
+from mivol.optim.priors import TotalVariation
 from mivol.photos.camera import Camera
 from mivol.photos.transforms import write_transforms
 from mivol.scene.sensors import to_sensor
@@ -132,8 +133,29 @@ def test_what_a_script_gets_wrong_is_said(scene: mi.Scene) -> None:
         Problem(scene, [seen()], [3])
     with refuses("found int"):
         Problem(scene, [seen()], [KEY], loss=3)
-    with refuses(r"found the class Adam, expected an optimizer object: write Adam\(\.\.\.\)"):
+    with refuses(r"found the class Adam, expected an object: write Adam\(\.\.\.\)"):
         optimize(Problem(scene, [seen()], [KEY]), mivol.Adam, 1)
+    with refuses(r"found the class L2, expected an object"):
+        Problem(scene, [seen()], [KEY], loss=L2)
+    with refuses(r"Adam: Expected `float` < 1.0 - at `\$.beta_1`"):
+        optimize(Problem(scene, [seen()], [KEY]), mivol.Adam(beta_1=1.5), 1)
+    with refuses(r"Huber: Expected `float` > 0.0 - at `\$.delta`"):
+        Problem(scene, [seen()], [KEY], loss=Huber(delta=-1.0))
+    with refuses(r"TotalVariation: Expected `float` >= 0.0 - at `\$.weight`"):
+        mivol.Parameter(KEY, priors=[TotalVariation(weight=-1.0)])
+    with refuses("found the priors L2.*expected a list of priors"):
+        mivol.Parameter(KEY, priors=L2())
+    for name, value in (("spp", 0), ("spp", 1.5), ("seed", -1)):
+        with refuses(f"found {value} as {name}, expected a whole number from"):
+            Problem(scene, [seen()], [KEY], **{name: value})
+    with refuses("found -1 as iterations, expected a whole number from 0 on"):
+        optimize(Problem(scene, [seen()], [KEY]), iterations=-1)
+    with refuses("integrator: found dict, expected an integrator"):
+        Problem(scene, [seen()], [KEY], integrator={"type": "mivol"})
+    with refuses("the scene has no sensor 1"):
+        Problem(scene, [seen()], [KEY], sensors=[1])
+    with refuses("found str, expected a sensor or its number"):
+        Problem(scene, [seen()], [KEY], sensors=["camera"])
     with refuses("Silent.begin returned a NoneType, expected a mivol.optim.optimizer.OptimizerRun"):
         optimize(Problem(scene, [seen()], [KEY]), Silent(), 1)
     with refuses("found str"):
