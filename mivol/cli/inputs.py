@@ -34,7 +34,7 @@ def explain(arguments: argparse.Namespace) -> int:
         from mivol.experiments.kinds import explain_experiment
 
         answer = explain_experiment(*load_experiment(arguments.scene, arguments), arguments.output)
-    elif not is_points_file(arguments.scene) and (arguments.scene.is_dir() or find_format(arguments.scene)):
+    elif find_format(arguments.scene) or (arguments.scene.is_dir() and not is_points_file(arguments.scene)):
         return explain_photos(arguments.scene, arguments.output)
     else:
         answer = _explain_file(arguments)
@@ -215,7 +215,7 @@ def load_experiment(path: Path, arguments: argparse.Namespace) -> tuple[Any, Pat
     from mivol.photos import find_format
 
     check_contents(path)
-    if path.is_dir() or (path.suffix.lower() == ".json" and find_format(path)):
+    if path.is_dir() or find_format(path):
         model = arguments.model or next(iter(config.MODELS))
         _check_preset(model, arguments.preset)
         return config.of_photographs(path, model, arguments.preset, arguments.set), Path()

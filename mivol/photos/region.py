@@ -78,21 +78,17 @@ def _nearest_point(cameras: Sequence[Camera]) -> np.ndarray | None:
     return np.linalg.solve(total, np.sum([a @ c.origin for a, c in zip(across, cameras, strict=True)], axis=0))
 
 
-def shared_box(cameras: Sequence[Camera], name: object = "cameras") -> np.ndarray:
-    """Return the box around the region shared by most views.
+def shared_box(cameras: Sequence[Camera], name: object = "cameras") -> np.ndarray | None:
+    """Return the box around the region shared by most views; None without such a region.
 
     The region holds the points seen by at least ``VIEW_SHARE`` of the views and nearer to the focus (:func:`find_focus`)
     than the median camera. The second condition bounds the region, because viewing frustums are infinite.
 
     Raises:
-        MivolError: parallel cameras, or views without a shared region.
+        MivolError: parallel cameras.
     """
     focus = find_focus(cameras, name)
-    box = _shared_region(cameras, focus, median_distance(cameras, focus))
-    if box is None:
-        way_out = 'choose box = "middle" for cameras that look around'
-        raise refusal(name, "views without a shared region", "cameras around one subject", way_out)
-    return box
+    return _shared_region(cameras, focus, median_distance(cameras, focus))
 
 
 def _shared_region(cameras: Sequence[Camera], focus: np.ndarray, reach: float) -> np.ndarray | None:

@@ -160,9 +160,9 @@ def survey_photos(
     frames = [PhotoFrame(e.file, cameras[id(e)], e.split, _mask(e), e.points, placed[id(e)].orientation) for e in chosen]
     training = [entry for entry in present if entry.split in ("train", "held_out")]
     looking = [cameras[id(entry)] for entry in training or chosen]
-    found_box, box_from = _box(box, listing, looking, path)
+    is_middle, (found_box, box_from) = _box(box, listing, looking, path)
     notes = [*listing.notes, *_note_changes(frames, [placed[id(entry)] for entry in chosen])]
-    if not isinstance(box, str):
+    if not is_middle:
         frames, note = _leave_out_views(frames, found_box, box is not None)
         notes += note
     near_far = region.near_and_far([*looking, *(frame.camera for frame in frames)], found_box)
@@ -341,22 +341,37 @@ def _mask(entry: Entry) -> Path | None:
     return entry.mask
 
 
-def _box(box: np.ndarray | str | None, listing: Listing, cameras: Sequence[Camera], path: Path) -> tuple[np.ndarray, str]:
+def _box(
+    box: np.ndarray | str | None, listing: Listing, cameras: Sequence[Camera], path: Path
+) -> tuple[bool, tuple[np.ndarray, str]]:
+    """Whether the box is the one in the middle, which cameras may look away from; the box, and how it was found."""
     points = listing.points
     if isinstance(box, str):
         if box != "middle":
             raise refusal("box", f'"{box}"', '"middle", or two corners', "choose one")
-        cube = region.middle_box(cameras, path)
-        half = float(cube[1, 0] - cube[0, 0]) / 2 / region.median_distance(cameras, cube.mean(axis=0))
-        seen = "" if half > 0.999 * region.MIDDLE else ", as wide as what the frames share"
-        return cube, f"{half:.2g} of the median distance of the cameras from their focus, on each side{seen}"
+        return True, _middle_box(cameras, path)
     if box is not None:
-        return region.check_box(box), "as given"
+        return False, (region.check_box(box), "as given")
     if listing.box is not None:
-        return listing.box, "around what the photographs show between their nearest and farthest distance"
+        return False, (listing.box, "around what the photographs show between their nearest and farthest distance")
     if points is not None and len(points) >= region.FEWEST_POINTS:
-        return region.box_of_points(points), f"98 % of {len(points)} points, enlarged by 5 % on each side"
-    return region.shared_box(cameras, path), f"in view of at least {100 * region.VIEW_SHARE:.0f} % of {len(cameras)} cameras"
+        return False, (region.box_of_points(points), f"98 % of {len(points)} points, enlarged by 5 % on each side")
+    seen, shared = (
+        f"in view of at least {100 * region.VIEW_SHARE:.0f} % of {len(cameras)} cameras",
+        region.shared_box(cameras, path),
+    )
+    if shared is not None:
+        return False, (shared, seen)
+    cube, size = _middle_box(cameras, path)
+    return True, (cube, f"{size}, because no place is {seen}")
+
+
+def _middle_box(cameras: Sequence[Camera], path: Path) -> tuple[np.ndarray, str]:
+    """The innermost of nested boxes, and a description of its size."""
+    cube = region.middle_box(cameras, path)
+    half = float(cube[1, 0] - cube[0, 0]) / 2 / region.median_distance(cameras, cube.mean(axis=0))
+    seen = "" if half > 0.999 * region.MIDDLE else ", as wide as what the frames share"
+    return cube, f"{half:.2g} of the median distance of the cameras from their focus, on each side{seen}"
 
 
 def _format_range(values: Sequence[float]) -> str:

@@ -48,7 +48,7 @@ class Frusta:
         if survey is None:
             return
         frames = survey.frames[:: -(-len(survey.frames) // MOST)]
-        scale = frustum_size(survey)
+        depth = frustum_size(survey)
         kinds = {id(frame): TRAIN if frame.split == "train" else HELD_OUT for frame in frames}
         shown = {
             kind: server.gui.add_checkbox(f"{kind} photographs ({sum(k == kind for k in kinds.values())})", True)
@@ -59,12 +59,13 @@ class Frusta:
             checkbox.on_update(lambda event, kind=kind: setattr(groups[kind], "visible", event.target.value))
         for number, frame in enumerate(frames):
             camera, kind = _pinhole(frame.camera), kinds[id(frame)]
+            across, up = np.divide(camera.size, 2 * camera.K[[0, 1], [0, 1]])
             x, y, z, w = Rotation.from_matrix(camera.to_world[:3, :3] * FLIP).as_quat()
             handle = server.scene.add_camera_frustum(
                 f"{groups[kind].name}/{number}",
-                fov=float(2 * np.arctan(camera.size[1] / 2 / camera.K[1, 1])),
-                aspect=camera.size[0] / camera.size[1],
-                scale=scale,
+                fov=float(2 * np.arctan(up)),
+                aspect=float(across / up),
+                scale=depth * float(np.cbrt(across * up / 3)),  # viser's scale is the third root of a third of the volume
                 thickness=1.5,
                 thickness_units="screen",
                 color=COLOURS[kind],

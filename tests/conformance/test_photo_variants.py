@@ -76,6 +76,21 @@ def test_photographs_of_another_machine_are_found(tmp_path: Path, head: str, suf
         np.testing.assert_array_equal(frame.camera.to_world, old)
 
 
+def test_cameras_that_look_around_get_the_box_in_their_middle(tmp_path: Path) -> None:
+    """Turned by half a turn about the vertical, the cameras of the ring have no place in common."""
+    folder = write_transforms(tmp_path / "set", {"fl_x": 20}, n=6)
+    assert "because no place is in view" not in survey_photos(folder).describe()
+
+    def turn(table: dict) -> None:
+        for frame in table["frames"]:
+            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([-1, 1, -1, 1])).tolist()
+
+    edit(folder / "transforms.json", turn)
+    survey = survey_photos(folder)
+    assert "because no place is in view of at least 90 % of 6 cameras" in survey.describe()
+    np.testing.assert_array_equal(survey.box, survey_photos(folder, box="middle").box)
+
+
 def test_a_matrix_of_the_camera_in_each_frame(tmp_path: Path) -> None:
     folder = write_transforms(tmp_path / "set", {"K": [[20, 0, 5.5], [0, 21, 4.5], [0, 0, 1]]})
     edit(folder / "transforms.json", lambda table: table["frames"][1].update(K=[[30, 0, 6], [0, 31, 4], [0, 0, 1.0]]))
@@ -290,6 +305,16 @@ def test_cameras_of_reality_capture(tmp_path: Path) -> None:
             np.testing.assert_allclose(frame.camera.K, [[30, 0, middle[0]], [0, 30, middle[1]], [0, 0, 1]])
             assert frame.camera.distortion == lens
     assert survey_photos(folder / "cameras.csv").format == "RealityCapture"
+
+
+@pytest.mark.parametrize("options", [(), ("--as", "gaussians")])
+@pytest.mark.parametrize("name", ["cameras.csv", "poses_bounds.npy", "transforms.json"])
+def test_commands_take_the_file_of_cameras(tmp_path: Path, name: str, options: tuple, capsys: pytest.CaptureFixture) -> None:
+    """Suffixes of points and arrays hold cameras as well. A fit of so small photographs is refused, after its facts."""
+    writers = {"cameras.csv": lambda folder: write_reality_capture(folder, (), ()), "poses_bounds.npy": write_llff}
+    write = writers.get(name, lambda folder: write_transforms(folder, {"fl_x": 20}))
+    main(["explain", str(write(tmp_path / "set") / name), *options])
+    assert ("experiment  set" if options else " photographs (") in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -137,11 +137,11 @@ def client(number: int, x: float = 0.0) -> SimpleNamespace:
     return SimpleNamespace(client_id=number, camera=camera, scene=scene, pictures=pictures, atomic=nullcontext)
 
 
-def make_page(monkeypatch: pytest.MonkeyPatch, output: Path | None) -> Page:
+def make_page(monkeypatch: pytest.MonkeyPatch, output: Path | None, survey: object = None) -> Page:
     """A page of a volume that can be cropped."""
     view = HomeView((0.0, 0.0, 1.0), (0.0, 0.0, 9.0), (0.0, 0.0, 0.0), 90.0, (200, 100))
     subject = SimpleNamespace(
-        name="smoke", title="smoke, 1 m", box=BOX, survey=None, has_values=True, can_crop=True, first_look=Look,
+        name="smoke", title="smoke, 1 m", box=BOX, survey=survey, has_values=True, can_crop=True, first_look=Look,
         first_view=lambda: view, save_crop=lambda folder, crop: folder / "smoke-crop.npz", refresh=lambda: True
     )  # fmt: skip
     monkeypatch.setattr(module, "check_viser", lambda: None)
@@ -169,6 +169,14 @@ def test_the_first_camera_and_the_sliders(monkeypatch: pytest.MonkeyPatch) -> No
     assert server.handles["status"].content == READ_ONLY
     assert [server.handles[name].is_disabled for name in ("save crop", "render film")] == [True, True]
     assert press(page, "save crop") == READ_ONLY and press(page, "render film") == READ_ONLY
+
+
+def test_a_page_begins_before_the_photograph_that_stands_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The photograph is a frustum's depth of 0.5 before its camera at (0, 0, 9), and hides what lies behind it."""
+    monkeypatch.setattr(module, "frustum_size", lambda survey: 0.5)
+    monkeypatch.setattr(module, "Frusta", lambda server, survey, fly: None)
+    place = make_page(monkeypatch, None, survey=object()).server.initial_camera.position
+    assert list(place[:2]) == [0, 0] and 7 < place[2] < 9 - 0.5
 
 
 def test_sliders_become_a_look(monkeypatch: pytest.MonkeyPatch) -> None:
