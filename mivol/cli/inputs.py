@@ -122,9 +122,12 @@ def check_contents(path: Path) -> None:
     """Refuse a volume, and binary data that no reader takes, in place of a scene, an experiment or a cloud."""
     from mivol.experiments.found_scan import describe_missing
     from mivol.files.formats import check_has_reader
+    from mivol.files.source import check_file
 
     check_has_reader(path)
     if holds_volume(path):
+        if not path.is_dir():
+            check_file(path)
         found = describe_missing(path) or "a volume"
         raise MivolError(f"{path}: found {found}, expected a scene, a fit or points; render, explain and convert take it.")
 

@@ -43,10 +43,11 @@ def refusal(subject: object, found: str, expected: str, way_out: str) -> MivolEr
         subject: file or parameter.
         found: actual content, shortened to ``LONGEST_QUOTE`` characters.
         expected: valid content.
-        way_out: advice for the user.
+        way_out: advice for the user, without a full stop; or a question, with its mark.
     """
     found = textwrap.shorten(found, LONGEST_QUOTE, placeholder=" ...")
-    return MivolError(f"{subject}: found {found}, expected {expected}; {way_out}.")
+    end = "" if way_out.endswith("?") else "."
+    return MivolError(f"{subject}: found {found}, expected {expected}; {way_out}{end}")
 
 
 # -- Files --------------------------------------------------------------------------------------------------------
@@ -84,7 +85,7 @@ def _suggest_name(path: Path) -> str:
     if not path.parent.is_dir():
         return f"the folder {path.parent} does not exist either"
     near = difflib.get_close_matches(path.name, (entry.name for entry in path.parent.iterdir()), 1)
-    return f"did you mean {near[0]}" if near else "check the spelling and the folder"
+    return f"did you mean {near[0]}?" if near else "check the spelling and the folder"
 
 
 def read_bytes(path: str | os.PathLike) -> bytes:
@@ -323,7 +324,7 @@ def select_dataset(path: object, dataset: str | None, names: Sequence[str]) -> s
         )
     if dataset not in names:
         near = difflib.get_close_matches(dataset, names, 1)
-        way_out = f"did you mean {near[0]!r}" if near else "choose another array"
+        way_out = f"did you mean {near[0]!r}?" if near else "choose another array"
         raise refusal(path, f"no array {dataset!r} (the file has {listed})", "an array of that name", way_out)
     return dataset
 

@@ -137,6 +137,13 @@ def test_a_scene_that_is_not_there(variant_rgb, folder: Path, capsys: pytest.Cap
     assert "no scene file" in refused(capsys, "render", folder / "none.xml")
 
 
+@pytest.mark.parametrize("verb", ["render", "optimize", "validate"])
+def test_a_volume_that_is_not_there(capsys: pytest.CaptureFixture, folder: Path, verb: str) -> None:
+    """Not that the file is a volume, which its suffix would say."""
+    said = refused(capsys, verb, folder / "none.vdb")
+    assert "none.vdb: found nothing there, expected an existing file" in said
+
+
 def test_explain_gives_a_reason_for_each_choice(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
     assert run("explain", folder / "scene.xml") == 0
     said = capsys.readouterr().out

@@ -26,7 +26,7 @@ RGB = made.numbered(channels=3)
 
 def assert_sentence(message: str, *words: str) -> None:
     """One line, one sentence, with its three parts and the given words."""
-    assert re.fullmatch(r"[^\n]+: found [^\n]+, expected [^\n]+; [^\n]+\.", message), message
+    assert re.fullmatch(r"[^\n]+: found [^\n]+, expected [^\n]+; [^\n]+[.?]", message), message
     for word in words:
         assert word in message, message
 
@@ -226,7 +226,7 @@ def test_bad_file(tmp_path: Path, name: str) -> None:
 
 def test_a_missing_file_suggests_a_similar_name(tmp_path: Path) -> None:
     (tmp_path / "smoke.vol").write_bytes(made.vol(ONE))
-    with refused("nothing there", "did you mean smoke.vol"):
+    with refused("nothing there", "did you mean smoke.vol?"):
         files.read_volume(tmp_path / "smoek.vol")
     with refused("nowhere does not exist"):
         files.read_volume(tmp_path / "nowhere" / "smoke.vol")
