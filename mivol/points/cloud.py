@@ -49,7 +49,7 @@ class PointCloud:
         colours: (N, 3) code values 0..1, float32; None: no colours.
 
     Raises:
-        MivolError: shapes that contradict each other.
+        MivolError: shapes that contradict each other, or whole numbers as colours.
     """
 
     positions: np.ndarray
@@ -60,6 +60,8 @@ class PointCloud:
         if self.positions.ndim != 2 or self.positions.shape[1] != 3:
             raise refusal("a cloud of points", f"positions of shape {self.positions.shape}", "(N, 3)", "reshape them")
         if self.colours is not None:
+            if np.asarray(self.colours).dtype.kind in "iu":
+                raise refusal("a cloud of points", "whole numbers as colours", "code values from 0 to 1", "divide bytes by 255")
             object.__setattr__(self, "colours", np.ascontiguousarray(self.colours, np.float32))
             if self.colours.shape != self.positions.shape:
                 found = f"colours of shape {self.colours.shape}"

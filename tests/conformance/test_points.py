@@ -111,6 +111,18 @@ def test_clouds_that_cannot_be_are_refused(tmp_path: Path) -> None:
             assert_refused(said, read_points, tmp_path / name)
 
 
+@pytest.mark.parametrize(
+    ("positions", "colours", "said"),
+    [
+        (np.zeros((5, 2)), None, r"positions of shape \(5, 2\), expected \(N, 3\)"),
+        (np.zeros((5, 3)), np.zeros((4, 3)), r"colours of shape \(4, 3\), expected \(5, 3\)"),
+        (np.zeros((5, 3)), np.full((5, 3), 200, np.uint8), "whole numbers as colours, expected code values from 0 to 1"),
+    ],
+)
+def test_arrays_that_make_no_cloud_are_refused(positions: np.ndarray, colours: np.ndarray | None, said: str) -> None:
+    assert_refused(said, PointCloud, positions, colours)
+
+
 def test_a_published_cloud_is_read(data_dir: Path) -> None:
     assert read_points(data_dir / "splats" / "points_halo_low_res.npy").count == 32314
 
