@@ -13,9 +13,9 @@ outside the box. Positions are float64, fractions of a voxel and entries float32
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import singledispatch
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property, singledispatch
 
 import drjit as dr
 import mitsuba as mi
@@ -23,11 +23,18 @@ import numpy as np
 import scipy.sparse
 
 from mivol.errors import MivolError
+from mivol.kernel_recording import copy_aligned, record_kernels
 from mivol.tomography.geometry import Geometry, VoxelGrid
 from mivol.tomography.projector import Projector
 
 LAYERS_AT_ONCE = 32
-"""Columns of a product: 32 floats are two cache lines, and a layer of 256^2 of them fits into a second-level cache."""
+"""Layers of a product: a lane reads 32 neighbouring floats, two cache lines, for each entry."""
+
+LANES = 16
+"""Voxels whose entries alternate in memory, so that the lanes of a vector read neighbours."""
+
+SMALL_PRODUCT = 1 << 26
+"""Most multiplications of a product that SciPy computes on one core: smaller ones read caches, and start no kernel."""
 
 MIN_PRODUCTS = 9
 """Products with A and its transpose per layer after which storing pays: storing an entry takes about 23 ns, and each pair of
@@ -42,58 +49,32 @@ class StoredProjector(Projector):
     ``A = H S``: H interpolates between the layers of the grid at the heights of the detector's rows, S is the stored matrix of
     a layer. Products agree with the walk's products to rounding, and ``A.T`` is the transpose of the same numbers.
 
-    Cost: 8 bytes per entry of S, and a multiplication per entry and layer.
+    Cost: 8 bytes per entry of S, twice for many layers, and a multiplication per entry and layer.
     """
 
-    def __init__(self, walk: Projector, blocks: Blocks, to_rows: scipy.sparse.csr_array | None) -> None:
+    def __init__(self, walk: Projector, matrix: RowBlocks | LayerMatrix, to_rows: scipy.sparse.csr_array | None) -> None:
         super().__init__(walk.geometry, walk.grid, walk.views, walk._kernels)
-        self._blocks, self._to_rows = blocks, to_rows
-        # Transposes copy nothing, but making a transpose takes as long as multiplying a view: make them once.
-        self._transposed = [block.T for block in blocks]
+        self._matrix, self._to_rows = matrix, to_rows
 
     @property
     def nbytes(self) -> int:
         """Bytes of the stored rows."""
-        return sum(part.nbytes for b in self._blocks for part in (b.data, b.indices, b.indptr))
+        return self._matrix.nbytes
 
     def subset(self, views: Sequence[int] | np.ndarray) -> StoredProjector:
         """Select the rows of some views, counted among this projector's own, in the same memory."""
-        walk = super().subset(views)
-        return StoredProjector(
-            walk, _select_views(self._blocks, np.asarray(views, int), self.projection_shape[2]), self._to_rows
-        )
+        matrix = self._matrix.select_views(np.asarray(views, int), self.projection_shape[2])
+        return StoredProjector(super().subset(views), matrix, self._to_rows)
 
     def _project_array(self, x: np.ndarray) -> np.ndarray:
         layers = x.reshape(self.grid.shape[0], -1)
         if self._to_rows is not None:
             layers = self._to_rows @ layers
-        views, rows, columns = self.projection_shape
-        if rows == 1:
-            return np.concatenate([block @ layers[0] for block in self._blocks])
-        y = np.empty((views * columns, rows), np.float32)
-        for part in _layer_slices(rows):
-            operand = np.ascontiguousarray(layers[part].T)
-            np.concatenate([block @ operand for block in self._blocks], out=y[:, part])
-        return y.reshape(views, columns, rows).transpose(0, 2, 1).reshape(-1)
+        return self._matrix.project(layers, self.projection_shape).reshape(-1)
 
     def _backproject_array(self, y: np.ndarray) -> np.ndarray:
-        views, rows, columns = self.projection_shape
-        y = y.reshape(views, rows, columns)
-        layers = np.empty((rows, self._blocks[0].shape[1]), np.float32)
-        for part in _layer_slices(rows):
-            operand = np.ascontiguousarray(y[:, part].transpose(0, 2, 1)).reshape(views * columns, -1)
-            layers[part] = self._back(operand[:, 0] if rows == 1 else operand).T
+        layers = self._matrix.backproject(y.reshape(self.projection_shape))
         return (layers if self._to_rows is None else self._to_rows.T @ layers).reshape(-1)
-
-    def _back(self, operand: np.ndarray) -> np.ndarray:
-        """Back-project; blocks are added up in float64, as passes of the walk are."""
-        if len(self._blocks) == 1:
-            return self._transposed[0] @ operand
-        total, start = np.zeros((self._blocks[0].shape[1], *operand.shape[1:])), 0
-        for transposed in self._transposed:
-            total += transposed @ operand[start : start + transposed.shape[1]]
-            start += transposed.shape[1]
-        return total
 
     def _project(self, values: mi.Float) -> mi.Float:
         return mi.Float(self._project_array(np.array(values)))
@@ -105,7 +86,15 @@ class StoredProjector(Projector):
 def matrix_bytes(projector: Projector) -> int | None:
     """Memory needed by :func:`store_matrix` [byte], counted without storing; None for rays that do not lie in layers."""
     lines = find_lines(projector.geometry, projector.grid, projector.views)
-    return None if lines is None else count_bytes(lines)
+    if lines is None:
+        return None
+    size = count_bytes(lines)
+    return size if is_small_product(projector.projection_shape[1], size // 8) else 2 * size
+
+
+def is_small_product(rows: int, entries: int) -> bool:
+    """Whether SciPy multiplies a layer's matrix, which is then stored once, without its transpose."""
+    return rows == 1 or rows * entries < SMALL_PRODUCT
 
 
 def is_worth_storing(rows: int, iterations: int, is_by_subsets: bool) -> bool:
@@ -132,7 +121,10 @@ def store_matrix(projector: Projector) -> Projector:
             "found rays that do not lie in layers of constant z, expected those of a parallel beam or of a fan of one row, "
             "whose layers share one matrix: walk them (solve.storage = walk)."
         )
-    return StoredProjector(projector, list(build_rows(lines)), _row_interpolation(projector, lines.heights))
+    blocks, (_, rows, columns) = list(build_rows(lines)), projector.projection_shape
+    is_small = is_small_product(rows, sum(block.nnz for block in blocks))
+    matrix = RowBlocks(blocks) if is_small else LayerMatrix.from_blocks(blocks, (columns, projector.grid.shape[2]))
+    return StoredProjector(projector, matrix, _row_interpolation(projector, lines.heights))
 
 
 def _row_interpolation(projector: Projector, heights: np.ndarray) -> scipy.sparse.csr_array | None:
@@ -142,28 +134,220 @@ def _row_interpolation(projector: Projector, heights: np.ndarray) -> scipy.spars
     inside = (where > -0.5) & (where < n - 0.5)
     held = np.clip(where, 0, n - 1)
     hats = np.maximum(0, 1 - np.abs(held[:, None] - np.arange(n))) * inside[:, None]
+    # A share below half a unit of float32 is rounding of the heights: most detectors have their rows on layers.
+    hats = np.where(hats < 2**-24, 0, hats).astype(np.float32)
     is_each_a_layer = hats.shape[0] == n and (hats == np.eye(n)).all()
-    return None if is_each_a_layer else scipy.sparse.csr_array(hats.astype(np.float32))
+    return None if is_each_a_layer else scipy.sparse.csr_array(hats)
 
 
-def _layer_slices(rows: int) -> list[slice]:
-    return [slice(first, min(first + LAYERS_AT_ONCE, rows)) for first in range(0, rows, LAYERS_AT_ONCE)]
+# -- Products by SciPy ------------------------------------------------------------------------------------------------------
 
 
-def _select_views(blocks: Blocks, views: np.ndarray, columns: int) -> Blocks:
-    """The rows of views, in their order; runs of neighbours stay together."""
-    begins = np.cumsum([0, *(block.shape[0] // columns for block in blocks)])
-    home = np.searchsorted(begins, views, "right") - 1
-    cuts = np.flatnonzero((np.diff(views) != 1) | (np.diff(home) != 0)) + 1
-    found = []
-    for run in np.split(np.arange(len(views)), cuts):
-        block, first = blocks[home[run[0]]], (views[run[0]] - begins[home[run[0]]]) * columns
-        ends = block.indptr[first : first + len(run) * columns + 1]
-        entries = slice(ends[0], ends[-1])
-        rows = (block.data[entries], block.indices[entries], ends - ends[0])
-        found.append(scipy.sparse.csr_array(rows, shape=(len(ends) - 1, block.shape[1])))
-    return found
+class RowBlocks:
+    """The matrix of a layer in blocks of rows, for small products and for a layer alone.
 
+    Args:
+        blocks: (lines, voxels of a layer) each, of whole views.
+    """
+
+    def __init__(self, blocks: Blocks) -> None:
+        self._blocks = blocks
+        # Transposes copy nothing, but making a transpose takes as long as multiplying a view: make them once.
+        self._transposed = [block.T for block in blocks]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the stored rows."""
+        return sum(part.nbytes for b in self._blocks for part in (b.data, b.indices, b.indptr))
+
+    def project(self, layers: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
+        """Line integrals (views, rows, cols) of layers (rows, voxels)."""
+        views, rows, columns = shape
+        operand = layers[0] if rows == 1 else np.ascontiguousarray(layers.T)
+        y = np.concatenate([block @ operand for block in self._blocks])
+        return y.reshape(views, columns, rows).transpose(0, 2, 1)
+
+    def backproject(self, y: np.ndarray) -> np.ndarray:
+        """Layers (rows, voxels) of projections; blocks are added up in float64, as passes of the walk are."""
+        views, rows, columns = y.shape
+        operand = np.ascontiguousarray(y.transpose(0, 2, 1)).reshape(views * columns, rows)
+        operand = operand[:, 0] if rows == 1 else operand
+        if len(self._blocks) == 1:
+            return np.ascontiguousarray((self._transposed[0] @ operand).T).reshape(rows, -1)
+        total, start = np.zeros((self._blocks[0].shape[1], *operand.shape[1:])), 0
+        for transposed in self._transposed:
+            total += transposed @ operand[start : start + transposed.shape[1]]
+            start += transposed.shape[1]
+        return np.ascontiguousarray(total.T, np.float32).reshape(rows, -1)
+
+    def select_views(self, views: np.ndarray, columns: int) -> RowBlocks:
+        """The rows of views, in their order; runs of neighbours stay together."""
+        begins = np.cumsum([0, *(block.shape[0] // columns for block in self._blocks)])
+        home = np.searchsorted(begins, views, "right") - 1
+        cuts = np.flatnonzero((np.diff(views) != 1) | (np.diff(home) != 0)) + 1
+        found = []
+        for run in np.split(np.arange(len(views)), cuts):
+            block, first = self._blocks[home[run[0]]], (views[run[0]] - begins[home[run[0]]]) * columns
+            ends = block.indptr[first : first + len(run) * columns + 1]
+            entries = slice(ends[0], ends[-1])
+            rows = (block.data[entries], block.indices[entries], ends - ends[0])
+            found.append(scipy.sparse.csr_array(rows, shape=(len(ends) - 1, block.shape[1])))
+        return RowBlocks(found)
+
+
+# -- Products with many layers ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class LayerMatrix:
+    """A sparse matrix whose kernels multiply ``LAYERS_AT_ONCE`` layers together on all cores; sums are float32.
+
+    The entries of ``LANES`` neighbouring rows alternate in memory: entry k of row i is at ``first[i] + k LANES``.
+
+    Attributes:
+        first, end: (rows,) place of the first entry, and the place beyond the last entry.
+        columns, entries: column and value of each place.
+        width: columns of the matrix.
+        per_line: successive rows, and columns, of a view or of a line of voxels.
+    """
+
+    first: np.ndarray
+    end: np.ndarray
+    columns: np.ndarray
+    entries: np.ndarray
+    width: int
+    per_line: tuple[int, int]
+
+    @classmethod
+    def from_blocks(cls, blocks: Blocks, per_line: tuple[int, int]) -> LayerMatrix:
+        """The matrix of blocks of rows; ``per_line`` of its rows, and of its columns."""
+        begins = np.cumsum([0, *(block.shape[0] for block in blocks)])
+        parts = [(slice(begin, begin + block.shape[0]), 0, block) for begin, block in zip(begins, blocks, strict=False)]
+        counts = np.concatenate([np.diff(block.indptr) for block in blocks])
+        return cls._interleave(counts, blocks[0].shape[1], per_line, parts)
+
+    @classmethod
+    def _interleave(
+        cls,
+        counts: np.ndarray,
+        width: int,
+        per_line: tuple[int, int],
+        parts: Iterable[tuple[slice, int, scipy.sparse.csr_array]],
+    ) -> LayerMatrix:
+        """Rows with ``counts`` entries, from parts: which rows, the number of their first column, and their entries."""
+        longest = np.pad(counts, (0, -len(counts) % LANES)).reshape(-1, LANES).max(1)
+        begins = LANES * np.concatenate([[0], np.cumsum(longest)])
+        first = (begins[:-1, None] + np.arange(LANES)).reshape(-1)[: len(counts)]
+        columns, entries, end = np.zeros(begins[-1], np.uint32), np.zeros(begins[-1], np.float32), first.copy()
+        for rows, column, part in parts:
+            size = np.diff(part.indptr)
+            at = np.repeat(end[rows] - LANES * part.indptr[:-1].astype(np.int64), size)
+            at += LANES * np.arange(part.nnz)
+            columns[at], entries[at] = part.indices + column, part.data
+            end[rows] += LANES * size
+        return cls(first, end, columns, entries, width, per_line)
+
+    @cached_property
+    def transposed(self) -> LayerMatrix:
+        """The transpose, stored as well."""
+        counts = np.zeros(self.width, np.int64)
+        for _, part in self._parts():
+            counts += np.bincount(part.indices, minlength=self.width)
+        columns = ((slice(None), begin, part.T.tocsr()) for begin, part in self._parts())
+        return self._interleave(counts, len(self.first), self.per_line[::-1], columns)
+
+    def _parts(self) -> Iterator[tuple[int, scipy.sparse.csr_array]]:
+        """Blocks of rows, and the number of their first row."""
+        counts = (self.end - self.first) // LANES
+        pieces = min(len(counts), 1 + int(counts.sum()) // PAIRS_PER_BLOCK)
+        for rows in np.array_split(np.arange(len(counts)), pieces):
+            own = counts[rows]
+            ends = np.concatenate([[0], np.cumsum(own)])
+            at = np.repeat(self.first[rows] - LANES * ends[:-1], own) + LANES * np.arange(ends[-1])
+            part = (self.entries[at], self.columns[at].astype(np.int32), ends)
+            yield int(rows[0]), scipy.sparse.csr_array(part, shape=(len(rows), self.width))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the entries and of their transpose."""
+        return 2 * (self.columns.nbytes + self.entries.nbytes)
+
+    def select_views(self, views: np.ndarray, columns: int) -> LayerMatrix:
+        """The rows of views, in their order."""
+        rows = (views[:, None] * columns + np.arange(columns)).reshape(-1)
+        return replace(self, first=self.first[rows], end=self.end[rows])
+
+    def project(self, layers: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
+        """Line integrals (views, rows, cols) of layers (rows, voxels)."""
+        views, rows, columns = shape
+        return self._multiply(layers).reshape(rows, views, columns).transpose(1, 0, 2)
+
+    def backproject(self, y: np.ndarray) -> np.ndarray:
+        """Layers (rows, voxels) of projections."""
+        return self.transposed._multiply(y.transpose(1, 0, 2).reshape(y.shape[1], -1))
+
+    @cached_property
+    def _order(self) -> np.ndarray:
+        """Order of the rows by strips of ``LANES`` rows of all lines, which read the same columns while a cache holds them."""
+        line, place = np.divmod(np.arange(len(self.first)), self.per_line[0])
+        return np.lexsort((place, line, place // LANES))
+
+    @cached_property
+    def _rows(self) -> _Rows:
+        first, end = (mi.UInt32(copy_aligned(part[self._order].astype(np.uint32))) for part in (self.first, self.end))
+        return _Rows(first, end, mi.UInt32(self.columns), mi.Float(self.entries))
+
+    def _multiply(self, layers: np.ndarray) -> np.ndarray:
+        """Multiply layers (layers, columns) float32: (layers, rows)."""
+        count, width = len(layers), min(LAYERS_AT_ONCE, 1 << (len(layers) - 1).bit_length())
+        pack, multiply = _record_products(width)
+        given, result = mi.Float(np.ascontiguousarray(layers).reshape(-1)), np.empty((count, len(self.first)), np.float32)
+        for first in range(0, count, width):
+            packed = dr.empty(mi.Float, width * self.width)
+            numbers = [dr.opaque(mi.UInt32, n) for n in (first, count, self.width)]
+            products = multiply(self._rows, pack(packed, given, *numbers))
+            for layer, product in zip(result[first : first + width], products, strict=False):
+                layer[self._order] = product.numpy()
+        return result
+
+
+@dataclass
+class _Rows:
+    """A :class:`LayerMatrix` in arrays of Dr.Jit."""
+
+    first: mi.UInt32
+    end: mi.UInt32
+    columns: mi.UInt32
+    entries: mi.Float
+
+
+@cache
+def _record_products(width: int) -> tuple[Callable, Callable]:
+    return record_kernels(_pack_layers, width), record_kernels(_multiply_layers, width)
+
+
+def _pack_layers(width: int, packed: mi.Float, given: mi.Float, first: mi.UInt32, count: mi.UInt32, n: mi.UInt32) -> mi.Float:
+    """Write ``width`` of ``count`` layers of n columns side by side, from the layer ``first``; beyond the last layer, 0."""
+    column = dr.arange(mi.UInt32, dr.width(packed) // width)
+    layers = [dr.gather(mi.Float, given, column + (first + k) * n, first + k < count) for k in range(width)]
+    dr.scatter(packed, mi.ArrayXf(layers), column)
+    return packed
+
+
+def _multiply_layers(width: int, rows: _Rows, packed: mi.Float) -> list[mi.Float]:
+    """The products of ``width`` layers, each (rows,)."""
+
+    def add(at: mi.UInt32, *total: mi.Float) -> tuple[mi.UInt32 | mi.Float, ...]:
+        entry, column = dr.gather(mi.Float, rows.entries, at), dr.gather(mi.UInt32, rows.columns, at)
+        values = dr.gather(mi.ArrayXf, packed, column, shape=(width, 1))
+        return at + LANES, *(dr.fma(entry, values[k], total[k]) for k in range(width))
+
+    state = (mi.UInt32(rows.first), *(mi.Float(0) for _ in range(width)))
+    _, *total = dr.while_loop(state, lambda at, *_: at < rows.end, add)
+    return total
+
+
+# -- The rows of a layer ----------------------------------------------------------------------------------------------------
 
 VOXELS_PER_ROW = 4
 """Most voxels of a row met by a line: hats are 2 wide, and a line crosses at most 2 voxels while crossing a row's hat."""

@@ -9,6 +9,7 @@ import pytest
 from refusals import assert_refused
 from small_scan import GRID, run
 
+from mivol.optim.projections import linear_problems
 from mivol.optim.projections.linear_problems import (
     LeastSquares,
     PoissonCounts,
@@ -37,8 +38,11 @@ def test_invalid_problems_are_refused(scan, build, sentence):
     assert_refused(sentence, build, scan[0], scan[2])
 
 
-def test_prior_derivatives_and_majorisers():
-    """Gradient against differences; the majoriser lies above the penalty, and its separable form above that."""
+@pytest.mark.parametrize("at_once", [linear_problems.KERNEL_VOXELS, 37])
+def test_prior_derivatives_and_majorisers(monkeypatch: pytest.MonkeyPatch, at_once: int) -> None:
+    """Gradient against differences; the majoriser lies above the penalty, and its separable form above that. A kernel takes all
+    voxels, or 37, which end within a line."""
+    monkeypatch.setattr(linear_problems, "KERNEL_VOXELS", at_once)
     shape, rng = (4, 5, 6), np.random.default_rng(5)
     prior = SmoothedTV(shape, 0.7, 0.4, (1.0, 0.5, 2.0))
     x, p = rng.normal(size=(2, 120))

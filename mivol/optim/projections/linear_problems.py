@@ -17,11 +17,15 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.kernel_recording import record_kernels
 from mivol.tomography.projector import Projector
 from mivol.tomography.rings import PixelGains
 
@@ -261,47 +265,23 @@ class SmoothedTV:
 
     def value(self, x: np.ndarray) -> float:
         """The penalty."""
-        total = 0.0
-        for layers in self._layers():
-            t = self._slope(self._differences(x, layers))
-            psi = np.where(t < self.delta, t * t / (2 * self.delta), t - self.delta / 2)
-            total += float(psi.sum(dtype=np.float64))
-        return self._scale * total
+        return self._scale * self._sum(_penalties, x)
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
         """(n,) derivative of the penalty."""
-        total = np.zeros(self.shape, x.dtype)
-        for layers in self._layers():
-            differences = self._differences(x, layers)
-            w = self._inverse_slope(differences)
-            for axis, d in enumerate(differences):
-                d *= w
-                d *= np.asarray(self._scale / self._spacing[axis], x.dtype)
-                self._spread(total, layers, axis, d, -d)
-        return total.reshape(-1)
+        return self._fill(_penalty_gradient, x)
 
     def curvature(self, x: np.ndarray, p: np.ndarray) -> float:
         """Second derivative of the majoriser at ``x`` along ``p``."""
-        total = 0.0
-        for layers in self._layers():
-            w = self._inverse_slope(self._differences(x, layers))
-            total += float(sum((w * d * d).sum(dtype=np.float64) for d in self._differences(p, layers)))
-        return self._scale * total
+        return self._scale * self._sum(_curvatures, x, p)
 
     def separable(self, x: np.ndarray) -> np.ndarray:
         """(n,) diagonal that majorises: ``(p - q)^2 <= 2 p^2 + 2 q^2`` on each difference."""
-        total = np.zeros(self.shape, x.dtype)
-        for layers in self._layers():
-            w = self._inverse_slope(self._differences(x, layers))
-            for axis, h in enumerate(self._spacing):
-                part = w * np.asarray(2 * self._scale / h**2, x.dtype)
-                self._spread(total, layers, axis, part, part)
-        return total.reshape(-1)
+        return self._fill(_separable_diagonal, x)
 
     def share_of_edges(self, x: np.ndarray) -> float:
         """Share of voxels with a slope of ``delta`` or more, which are preserved as edges."""
-        edges = sum(int(np.sum(self._slope(self._differences(x, layers)) >= self.delta)) for layers in self._layers())
-        return edges / x.size
+        return self._sum(_edges, x) / x.size
 
     @property
     def _spacing(self) -> np.ndarray:
@@ -311,45 +291,117 @@ class SmoothedTV:
     def _scale(self) -> float:
         return self.strength * float(np.prod(self._spacing))
 
-    def _layers(self) -> Iterator[slice]:
-        """Slices of a few layers each."""
-        n, at_once = self.shape[0], max(1, BLOCK // (self.shape[1] * self.shape[2]))
-        return (slice(first, min(first + at_once, n)) for first in range(0, n, at_once))
+    def _fill(self, function: Callable, x: np.ndarray) -> np.ndarray:
+        result = np.empty_like(x)
+        for voxels, part in self._run(function, x):
+            result[voxels] = part
+        return result
 
-    def _differences(self, x: np.ndarray, layers: slice) -> list[np.ndarray]:
-        """Forward differences of some layers along z, y and x, each over its spacing."""
-        x = x.reshape(self.shape)
-        part = x[layers]
-        above = x[layers.start + 1 : layers.stop + 1]
-        found = [np.zeros_like(part) for _ in range(3)]
-        np.subtract(above, part[: len(above)], out=found[0][: len(above)])
-        np.subtract(part[:, 1:], part[:, :-1], out=found[1][:, :-1])
-        np.subtract(part[:, :, 1:], part[:, :, :-1], out=found[2][:, :, :-1])
-        for d, h in zip(found, self._spacing, strict=True):
-            d /= h.astype(x.dtype)
+    def _sum(self, function: Callable, *fields: np.ndarray) -> float:
+        return float(sum(part.sum(dtype=np.float64) for _, part in self._run(function, *fields)))
+
+    def _run(self, function: Callable, *fields: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
+        """One number for each voxel, part by part, by a kernel that reads fields (n,) in place."""
+        array = mi.Float64 if fields[0].dtype == np.float64 else mi.Float
+        given = [array(np.ascontiguousarray(x, fields[0].dtype).reshape(-1)) for x in fields]
+        n_z, n_y, n_x = self.shape
+        sizes = [dr.opaque(mi.UInt32, n) for n in (n_x * n_y, n_x, 1, n_z, n_y, n_x)]
+        inverses = [dr.opaque(mi.Float64, 1 / n) for n in (n_x, n_y)]
+        numbers = [dr.opaque(array, v) for v in (*(1 / self._spacing), self.delta, self._scale)]
+        for first in range(0, fields[0].size, KERNEL_VOXELS):
+            count = min(KERNEL_VOXELS, fields[0].size - first)
+            lattice = _Slopes(dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first), sizes, inverses, numbers)
+            yield slice(first, first + count), _record(function)(lattice, *given).numpy()
+
+
+KERNEL_VOXELS = 1 << 22
+"""Voxels of a kernel of the total variation: its result takes 16 MiB."""
+
+
+@cache
+def _record(function: Callable) -> Callable:
+    return record_kernels(function)
+
+
+@dataclass
+class _Slopes:
+    """Forward differences of the voxels' values along z, y and x, each over its spacing; 0 at the far borders.
+
+    Attributes:
+        voxel: numbers of voxels.
+        sizes: numbers from a voxel to the next along z, y and x, and (Z, Y, X).
+        inverses: 1 / X and 1 / Y.
+        numbers: 1 / spacing along z, y and x, delta, and the factor on the sum over voxels.
+    """
+
+    voxel: mi.UInt32
+    sizes: list[mi.UInt32]
+    inverses: list[mi.Float64]
+    numbers: list[mi.Float]
+
+    def neighbours(self) -> list[tuple[mi.Bool, mi.Bool]]:
+        """Whether there is a voxel before, and after, along z, y and x."""
+        n_z, n_y, n_x = self.sizes[3:]
+        # Exact below 2^32: half a step from the next whole number. Processors have no vector division of integers.
+        line = mi.UInt32((mi.Float64(self.voxel) + 0.5) * self.inverses[0])
+        layer = mi.UInt32((mi.Float64(line) + 0.5) * self.inverses[1])
+        places = ((layer, n_z), (line - layer * n_y, n_y), (self.voxel - line * n_x, n_x))
+        return [(at > 0, at + 1 < size) for at, size in places]
+
+    def differences(self, x: mi.Float, before: int | None = None) -> list[mi.Float]:
+        """Differences at each voxel, or at the voxel before it along an axis (0 without such a voxel)."""
+        neighbours, voxel, is_there = self.neighbours(), self.voxel, mi.Bool(True)
+        exists = [after for _, after in neighbours]
+        if before is not None:
+            voxel, is_there = voxel - self.sizes[before], neighbours[before][0]
+            exists = [is_there & (axis == before or after) for axis, after in enumerate(exists)]
+        own, found = dr.gather(type(x), x, voxel, is_there), []
+        for axis, e in enumerate(exists):
+            found.append(dr.select(e, (dr.gather(type(x), x, voxel + self.sizes[axis], e) - own) * self.numbers[axis], 0))
         return found
 
-    def _spread(self, total: np.ndarray, layers: slice, axis: int, ahead: np.ndarray, here: np.ndarray) -> None:
-        """Add to both ends of the differences of some layers along an axis; the far border has no difference."""
-        if axis:
-            inner, front, back = total[layers], _part(axis, slice(None, -1)), _part(axis, slice(1, None))
-            inner[back] += ahead[front]
-            inner[front] += here[front]
-            return
-        count = min(layers.stop, self.shape[0] - 1) - layers.start
-        total[layers.start + 1 : layers.start + 1 + count] += ahead[:count]
-        total[layers.start : layers.start + count] += here[:count]
+    def inverse_slope(self, differences: list[mi.Float]) -> mi.Float:
+        """``psi'(t) / t`` of the length t of the gradient."""
+        return 1 / dr.maximum(dr.sqrt(sum(d * d for d in differences)), self.numbers[3])
 
-    def _inverse_slope(self, differences: list[np.ndarray]) -> np.ndarray:
-        return 1.0 / np.maximum(self._slope(differences), self.delta)
-
-    @staticmethod
-    def _slope(differences: list[np.ndarray]) -> np.ndarray:
-        return np.sqrt(sum(d * d for d in differences))
+    def gather_ends(self, x: mi.Float, part: Callable[[mi.Float, mi.Float, int], tuple[mi.Float, mi.Float]]) -> mi.Float:
+        """Sum over differences that begin or end at a voxel: ``part(w, d, axis)`` is the share of a begin, and of an end."""
+        own, total = self.differences(x), 0
+        w = self.inverse_slope(own)
+        for axis, (is_before, is_after) in enumerate(self.neighbours()):
+            total += dr.select(is_after, part(w, own[axis], axis)[0], 0)
+            before = self.differences(x, axis)
+            total += dr.select(is_before, part(self.inverse_slope(before), before[axis], axis)[1], 0)
+        return total
 
 
-def _part(axis: int, where: slice) -> tuple[slice, ...]:
-    return tuple(where if i == axis else slice(None) for i in range(3))
+def _penalties(slopes: _Slopes, x: mi.Float) -> mi.Float:
+    t, delta = dr.sqrt(sum(d * d for d in slopes.differences(x))), slopes.numbers[3]
+    return dr.select(t < delta, t * t / (2 * delta), t - delta / 2)
+
+
+def _edges(slopes: _Slopes, x: mi.Float) -> mi.Float:
+    return dr.select(dr.sqrt(sum(d * d for d in slopes.differences(x))) >= slopes.numbers[3], mi.Float(1), 0)
+
+
+def _curvatures(slopes: _Slopes, x: mi.Float, p: mi.Float) -> mi.Float:
+    return slopes.inverse_slope(slopes.differences(x)) * sum(d * d for d in slopes.differences(p))
+
+
+def _penalty_gradient(slopes: _Slopes, x: mi.Float) -> mi.Float:
+    def ends(w: mi.Float, d: mi.Float, axis: int) -> tuple[mi.Float, mi.Float]:
+        flow = w * d * (slopes.numbers[4] * slopes.numbers[axis])
+        return -flow, flow
+
+    return slopes.gather_ends(x, ends)
+
+
+def _separable_diagonal(slopes: _Slopes, x: mi.Float) -> mi.Float:
+    def ends(w: mi.Float, _: mi.Float, axis: int) -> tuple[mi.Float, mi.Float]:
+        part = w * (2 * slopes.numbers[4] * slopes.numbers[axis] ** 2)
+        return part, part
+
+    return slopes.gather_ends(x, ends)
 
 
 CHORD = 0.47
