@@ -18,7 +18,7 @@ import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +73,7 @@ class Poses:
         cameras: number of cameras.
         others: photographs of each further model, which has no part in common with the first.
         best: photograph without a pose -> the photograph with the most points in common with it, and their number.
+        left_out: damaged photographs, and copies of others.
     """
 
     folder: Path
@@ -83,6 +84,7 @@ class Poses:
     cameras: int
     others: tuple[tuple[str, ...], ...] = ()
     best: Mapping[str, tuple[str, int]] = field(default_factory=dict)
+    left_out: tuple[str, ...] = ()
 
     def describe(self) -> str:
         """Describe the result in a paragraph."""
@@ -125,8 +127,8 @@ def find_poses(folder: Path, say: Callable[[str], None] = lambda line: None, is_
         KeyboardInterrupt: Ctrl-C; features and matches stay in ``WORK``, and the next search of the same photographs
             continues with them.
     """
-    images, names = _check_folder(folder)
-    names = _leave_out_copies(folder, images, _leave_out_damaged(folder, images, names, say), say)
+    images, listed = _check_folder(folder)
+    names = _leave_out_copies(folder, images, _leave_out_damaged(folder, images, listed, say), say)
     names = sorted(names, key=split_numbers)
     work = folder / WORK
     _begin_work(work, images, names)
@@ -158,7 +160,7 @@ def find_poses(folder: Path, say: Callable[[str], None] = lambda line: None, is_
         shutil.rmtree(work, ignore_errors=True)
         raise
     shutil.rmtree(work, ignore_errors=True)
-    return poses
+    return replace(poses, left_out=tuple(name for name in listed if name not in names))
 
 
 def check_colmap() -> None:

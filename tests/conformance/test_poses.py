@@ -138,7 +138,7 @@ def test_damaged_photographs_are_left_out_and_named(folder: Path, job: dict) -> 
     whole = (images / "near" / "d.jpg").read_bytes()
     (images / "a.jpg").write_bytes(b"no image")
     (images / "near" / "e.jpg").write_bytes(whole[: len(whole) // 2])
-    poses.find_poses(folder, said.append)
+    assert poses.find_poses(folder, said.append).left_out == ("a.jpg", "near/e.jpg")
     assert any(line.startswith("2 of 5 photographs are damaged and left out: a.jpg, near/e.jpg; copy") for line in said)
     assert job["order"] == ["b.png", "near/c.webp", "near/d.jpg"]
     shutil.rmtree(folder / "sparse")
@@ -157,7 +157,7 @@ def test_copies_are_left_out(folder: Path, job: dict) -> None:
     images, said = folder / "images", []
     (images / "near" / "f.jpg").write_bytes((images / "a.jpg").read_bytes())
     found = poses.find_poses(folder, said.append)
-    assert "1 of 6 photographs are copies of others and left out" in said
+    assert "1 of 6 photographs are copies of others and left out" in said and found.left_out == ("near/f.jpg",)
     assert sorted([*found.posed, *found.unposed]) == ["a.jpg", "b.png", "near/c.webp", "near/d.jpg", "near/e.jpg"]
     shutil.rmtree(folder / "sparse")
     for name in ("b.png", "near/c.webp", "near/d.jpg", "near/e.jpg"):
@@ -246,9 +246,16 @@ def test_a_sequence_is_matched_with_neighbours_and_with_what_looks_alike() -> No
 
 def test_a_page_shows_cameras_and_errors(tmp_path: Path) -> None:
     folder = write_colmap(tmp_path / "a b")
-    found = poses.Poses(folder / "sparse" / "0", ("a.png", "b.png"), ("c<d>.png",), 0.734, 12, 1)
+    found = poses.Poses(folder / "sparse" / "0", ("a.png", "b.png"), ("c<d>.png",), 0.734, 12, 1, left_out=("half.jpg",))
     text = cameras.write_poses_page(folder, found).read_text()
-    for fact in ("2 of 3", "0.73 pixels", "c&lt;d&gt;.png", "data:image/png;base64,", f"mivol view &#x27;{folder}&#x27;"):
+    for fact in (
+        "2 of 3",
+        "0.73 pixels",
+        "c&lt;d&gt;.png",
+        "half.jpg",
+        "data:image/png;base64,",
+        f"mivol view &#x27;{folder}&#x27;",
+    ):
         assert fact in text
     assert "http" not in text
 
