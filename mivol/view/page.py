@@ -385,14 +385,14 @@ class Page:
         count = int(self._seconds.value) * FRAMES_A_SECOND
         cameras = interpolate_cameras([replace(key, K=first.K, size=first.size) for key in self._keys], count)
         self._film = FilmJob(cameras, new_file(self.output, f"{self.subject.name}-film", film_suffix()))
+        self._say(f"film: 0 of {len(cameras)} frames")
 
     def _film_step(self) -> None:
         """Draw the next frame of the film; write the file after the last."""
         job = self._film
         if len(job.frames) < len(job.cameras):
             job.frames.append(self.painter.draw(job.cameras[len(job.frames)]))
-            if len(job.frames) % FRAMES_A_SECOND == 0:
-                self._say(f"film: {len(job.frames)} of {len(job.cameras)} frames")
+            self._say(f"film: {len(job.frames)} of {len(job.cameras)} frames")
             return
         self._film = None
         write_video(job.path, iter(job.frames), fps=FRAMES_A_SECOND)

@@ -237,11 +237,12 @@ def test_a_path_and_its_film(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
     assert page.server.drawn["/path"].tolist() == [[0, 0, 5], [1, 0, 5]]
     page.server.handles["seconds"].value = 1
     page._begin_film()
+    assert page.server.handles["status"].content == "film: 0 of 25 frames"
     page._begin_film()
     assert page.server.handles["status"].content == "a film is in the making"
-    for _ in range(FRAMES_A_SECOND):
+    for count in range(1, FRAMES_A_SECOND + 1):
         page.step(0.0)
-    assert page.server.handles["status"].content == "film: 25 of 25 frames"
+        assert page.server.handles["status"].content == f"film: {count} of 25 frames"
     page.step(0.0)
     ((path, frames, fps),) = written
     assert page.server.handles["status"].content == f"wrote {path}" and path.stem == "smoke-film" and fps == FRAMES_A_SECOND
