@@ -400,14 +400,14 @@ def describe_speed(field: SphericalGrid | Octree, other: SphericalGrid | Octree,
     """Pixels a second of two fields and their ratio (:func:`compare_speed`)."""
     rates, ratio = compare_speed(field, other)
     first, second = (rate / 1e6 for rate in rates)
-    return f"{first:.1f} M pixels a second of processor time, {other_name} {second:.1f}: {ratio:.2f} times as many"
+    return f"{first:.1f} M pixels per second of processor time, {ratio:.2f} times the rate of {other_name} ({second:.1f} M)"
 
 
 def describe_leaves(tree: Octree) -> str:
     """Number, sizes and degree of the leaves of an octree."""
     sizes = np.bincount(tree.sizes)
-    kinds = ", ".join(f"{n} of {2**k}" for k, n in enumerate(sizes) if n)
-    return f"{tree.leaves} leaves in 2^{tree.depth} cells along an axis ({kinds} cells an edge), degree {tree.degree}"
+    edges = ", ".join(f"{2**k} ({n})" for k, n in enumerate(sizes) if n)
+    return f"{tree.leaves} leaves in 2^{tree.depth} cells along an axis, with edges of {edges} cells; degree {tree.degree}"
 
 
 def describe_field(path: Path, variant: str) -> Explanation:

@@ -206,7 +206,8 @@ def convert_to_mesh(source: Path, target: Path, resolution: int, box: Sequence[f
     lines = [
         f"{target}: {len(mesh.points)} points, {len(mesh.faces)} triangles, fused from {FUSED} views",
         f"distance from the depth of the splats: median {loss.median:.3g} ({loss.median / voxel:.2g} voxels), {nine_tenths}",
-        f"{100 * loss.missed:.2g} % of the pixels that splats hide show no mesh, {100 * loss.invented:.2g} % of the others do",
+        f"{100 * loss.missed:.2g} % of the pixels that show splats show no mesh; "
+        f"{100 * loss.invented:.2g} % of the other pixels show the mesh",
         VIEWED,
     ]
     return "\n".join(lines)
