@@ -13,9 +13,11 @@ from __future__ import annotations
 import json
 import os
 import time
+import xml.etree.ElementTree as ElementTree
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -277,10 +279,39 @@ class SceneSubject(Subject):
             self.box = np.array([[-1.0] * 3, [1.0] * 3])
         sensors = [sensor for sensor in self.scene.sensors() if sensor.class_name() == "PerspectiveCamera"]
         self.home = find_home_view([to_camera(sensors[0])], self.box) if sensors else None
+        if self.home is not None and (target := find_target(path, self.home)) is not None:
+            self.home = replace(self.home, target=target)
 
     def draw(self, camera: Camera, look: Look, seed: int = 0) -> np.ndarray:
         sensor = mi.load_dict(to_sensor(camera))
         return np.array(self.integrator.render(self.scene, sensor, seed=seed, spp=1))[..., :3]
+
+
+def find_target(path: Path, home: HomeView) -> tuple[float, ...] | None:
+    """Return the point (3,) at which a ``lookat`` of a scene in XML aims the camera of its first view [length].
+
+    The middle of a scene with a far background lies far from what the camera shows, and drags turn about this point.
+
+    Returns:
+        None for a scene without such a ``lookat``, as of a camera placed by other transforms.
+    """
+    try:
+        looks = list(ElementTree.parse(path).getroot().iterfind("sensor/transform/lookat")) if path.suffix == ".xml" else []
+    except ElementTree.ParseError:
+        return None
+    for look in looks:
+        words = look.get("target", "").replace(",", " ").split()
+        with suppress(ValueError):
+            ahead = np.subtract([float(word) for word in words], home.origin)
+            forward = np.subtract(home.target, home.origin)
+            # Off by 1e-3 of the distance at most: Mitsuba holds the transform in single precision.
+            if ahead.shape == (3,) and ahead @ forward > 0 and _sine(ahead, forward) < 1e-3:
+                return tuple((home.origin + ahead).tolist())
+    return None
+
+
+def _sine(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.linalg.norm(np.cross(a, b)) / (np.linalg.norm(a) * np.linalg.norm(b)))
 
 
 class PhotoSubject(Subject):

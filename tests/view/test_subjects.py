@@ -16,6 +16,7 @@ from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_volume, write_volume
 from mivol.points import Gaussians, read_gaussians, write_gaussians
 from mivol.report.record import RunRecord, write_record
+from mivol.scene.sensors import to_camera
 from mivol.view.subjects import Look, RunSubject, find_model, open_subject
 from mivol.view.transfer import Transfer
 
@@ -127,3 +128,27 @@ def test_foreign_paths_are_refused_in_a_sentence(tmp_path: Path) -> None:
     known = (("missing", "no file"), ("empty", "mivol poses"), ("a.pdf", "mivol explain"), ("scan.zip", "unpack it"))
     for name, word in known:
         assert_refused(word, open_subject, tmp_path / name)
+
+
+LOOKAT = '<lookat origin="0,-4,0" target="0, 1 0.5" up="0 0 1"/>'
+
+
+@pytest.mark.parametrize(
+    ("transform", "is_aimed"),
+    [
+        (LOOKAT, True),
+        (LOOKAT + '<translate x="1"/>', False),  # moves the target as well
+        ('<matrix value="1 0 0 0 0 0 1 -4 0 -1 0 0 0 0 0 1"/>', False),
+    ],
+)
+def test_a_scene_turns_about_what_its_camera_looks_at(variant_rgb: str, tmp_path: Path, transform: str, is_aimed: bool) -> None:
+    """The target is 5 and 0.5 away; the middle of the scene, a ball of radius 100 around (90, 0, 0), is elsewhere."""
+    path = tmp_path / "scene.xml"
+    sensor = f'<sensor type="perspective"><transform name="to_world">{transform}</transform></sensor>'
+    ball = '<shape type="sphere"><float name="radius" value="100"/><point name="center" x="90" y="0" z="0"/></shape>'
+    path.write_text(f'<scene version="3.0.0">{sensor}<integrator type="direct"/>{ball}</scene>')
+    subject = open_subject(path)
+    ahead = np.subtract(subject.home.target, subject.home.origin)
+    reach = np.linalg.norm(ahead)
+    assert (reach == pytest.approx(25.25**0.5, rel=1e-6)) == is_aimed
+    np.testing.assert_allclose(ahead / reach, to_camera(subject.scene.sensors()[0]).forward, atol=1e-5)
