@@ -98,12 +98,10 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
 
     # -- The radiance of stems and branches ------------------------------------------------------------------------------
     stem_light, _, stems = walk_light(replayed, start.clone(), stops=True)
-    light, lane = _PackedLight.of(stem_light), dr.arange(mi.UInt32, n)
     dr.schedule(dL)
     branching = _Branching.of(estimators, stems, first)
-    stem, branches = branching.gather(lane)
+    _, branches = branching.gather(dr.arange(mi.UInt32, n))
     L, _, path = walk_light(replayed, branches.in_memory(), stops=False)
-    light.add(L * branching.share, stem, branches.active)
     lengths = _Lengths.of(path.depth)
     dr.eval(lengths)
 
@@ -111,7 +109,7 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
     order = lengths.sort()
     stem, branches = branching.gather(order)
     branch_score = Replay(dr.gather(mi.Spectrum, L, order), dr.gather(mi.Spectrum, dL, stem) * branching.share)
-    stem_score = Replay(light.gather(lane), dL)
+    stem_score = Replay(branching.add_light(stem_light, L), dL)
 
     def replay(is_stem: mi.Bool) -> None:
         begun, score = dr.select(is_stem, (start.clone(), stem_score), (branches.clone(), branch_score))
@@ -136,14 +134,12 @@ def carry_tangents(estimators: Estimators, rays: CameraRays) -> mi.Spectrum:
     dlog = dr.zeros(mi.Spectrum, len(lane))
     dr.make_opaque(dlog)
     score, _, stems = walk_in_kernel(estimators, start, Tangent(black, dlog), stops=True, probes=probes)
-    total = _PackedLight.of(score.dL)
     branching = _Branching.of(estimators, stems, first)
     stem, branches = branching.gather(lane)
     dlog = dr.gather(mi.Spectrum, score.dlog, stem)
     dr.eval(dlog)
-    score, _, _ = walk_in_kernel(estimators, branches.in_memory(), Tangent(black, dlog), stops=False, probes=probes)
-    total.add(score.dL * branching.share, stem, branches.active)
-    return total.gather(lane)
+    later, _, _ = walk_in_kernel(estimators, branches.in_memory(), Tangent(black, dlog), stops=False, probes=probes)
+    return branching.add_light(score.dL, later.dL)
 
 
 def replay_in_one_kernel(width: int, walk: Callable[[mi.Bool], object]) -> None:
@@ -166,52 +162,20 @@ def replay_in_one_kernel(width: int, walk: Callable[[mi.Bool], object]) -> None:
 
 
 @dataclass
-class _PackedLight:
-    """Radiances as one array, to which Dr.Jit adds all colours of a lane at once.
-
-    Attributes:
-        values: colours fastest, with a zero after three colours: Dr.Jit writes 1, 2 or 4 numbers at once.
-        colours: number of colours.
-    """
-
-    values: mi.Float
-    colours: int
-
-    @classmethod
-    def of(cls, L: mi.Spectrum) -> _PackedLight:
-        """Pack the radiance of each lane."""
-        packed = cls(dr.empty(mi.Float, 0), len(L))
-        row = packed._pad(L)
-        packed.values = dr.empty(mi.Float, len(row) * dr.width(L))
-        dr.scatter(packed.values, row, dr.arange(mi.UInt32, dr.width(L)))
-        return packed
-
-    def add(self, L: mi.Spectrum, index: mi.UInt32, active: mi.Bool) -> None:
-        """Add radiances to the lanes with an index."""
-        dr.scatter_add(self.values, self._pad(L), index, active)
-
-    def gather(self, index: mi.UInt32) -> mi.Spectrum:
-        """The radiance of the lanes with an index."""
-        shape = (len(self._pad(dr.zeros(mi.Spectrum))), dr.width(index))
-        return mi.Spectrum(*dr.gather(mi.ArrayXf, self.values, index, shape=shape)[: self.colours])
-
-    def _pad(self, L: mi.Spectrum) -> mi.ArrayXf:
-        return mi.ArrayXf([*L, *[mi.Float(0)] * (self.colours == 3)])
-
-
-@dataclass
 class _Branching:
     """The collisions at the ends of stems, each with as many branches.
 
     Attributes:
         start: starts of branches, without their random numbers: at the collisions, with the random numbers of the stems.
         collided: the stems with a collision; the other numbers are left over.
+        place: place of each stem with a collision in ``collided``.
         count: number of these stems (an array of one number).
         each: branches of a stem (an array of one number).
     """
 
     start: PathStart
     collided: mi.UInt32
+    place: mi.UInt32
     count: mi.UInt32
     each: mi.UInt32
 
@@ -226,11 +190,11 @@ class _Branching:
         """
         start, baseline = PathStart.at_stop(stems, sampler), estimators.segment.baseline
         noise, n = USUAL_NOISE if baseline is None else baseline.noise, dr.width(start.active)
-        count, collided = dr.opaque(mi.UInt32, 0), dr.zeros(mi.UInt32, n)
+        count, collided = dr.opaque(mi.UInt32, 0), dr.empty(mi.UInt32, n)
         place = dr.scatter_inc(count, mi.UInt32(0), start.active)
         dr.scatter(collided, dr.arange(mi.UInt32, n), place, start.active)
-        dr.eval(start, collided, count)
-        return cls(start, collided, count, count_branches(n, count, noise))
+        dr.eval(start, collided, place, count)
+        return cls(start, collided, place, count, count_branches(n, count, noise))
 
     @property
     def share(self) -> mi.Float:
@@ -247,6 +211,15 @@ class _Branching:
         start = self.start.gather(stem, on)
         start.sampler = start.sampler.branch(number % self.each, self.each)
         return stem, start
+
+    def add_light(self, stems: mi.Spectrum, branches: mi.Spectrum) -> mi.Spectrum:
+        """The radiance of each stem, with its share of the radiance of its branches."""
+
+        def add(number: mi.UInt32, L: mi.Spectrum) -> tuple[mi.UInt32, mi.Spectrum]:
+            return number + 1, L + dr.gather(mi.Spectrum, branches, self.place * self.each + number) * self.share
+
+        begun = dr.zeros(mi.UInt32, dr.width(stems)), mi.Spectrum(stems)
+        return dr.while_loop(begun, lambda number, L: self.start.active & (number < self.each), add, label="branches")[1]
 
 
 @dataclass

@@ -153,8 +153,9 @@ class BaselineSums:
         rows = [W, S, Q, S * own, dr.select(W > 0, mi.Float(1), 0)]
         totals = dr.zeros(mi.Float, len(rows) * colours + 1)
         for k, row in enumerate(rows):
-            dr.scatter_add(totals, row, colour + k * colours)
-        dr.scatter_add(totals, dr.gather(mi.Float, self.sums, i + 3 * colours * n, i < n), len(rows) * colours, i < n)
+            dr.scatter_add(totals, row, colour + k * colours, mode=dr.ReduceMode.Direct)
+        events = dr.gather(mi.Float, self.sums, i + 3 * colours * n, i < n)
+        dr.scatter_add(totals, events, len(rows) * colours, i < n, dr.ReduceMode.Direct)
         total_W, total_S, total_Q, explained, filled = (
             dr.gather(mi.Float, totals, colour + k * colours) for k in range(len(rows))
         )
@@ -171,7 +172,7 @@ class BaselineSums:
         values = mean + dr.select(W > 0, share * (own - mean), 0)
 
         left = dr.zeros(mi.Float, 1)
-        dr.scatter_add(left, Q - 2 * values * S + dr.square(values) * W, mi.UInt32(0))
+        dr.scatter_add(left, Q - 2 * values * S + dr.square(values) * W, mi.UInt32(0), mode=dr.ReduceMode.Direct)
         dr.eval(values, left, mean)
         known = sum(dr.gather(mi.Float, totals, mi.UInt32(2 * colours + c)) for c in range(colours))
         return Baseline(self.blocks, values, n, mean, _ratio(dr.maximum(left, 0), known))
