@@ -128,6 +128,7 @@ class Setting(NamedTuple):
     Attributes:
         key: dotted key; an entry of a list has the number 0; a key of a choice has the choice's name in brackets.
         default: default as Python writes it; "" for required settings and tables.
+        domain: allowed numbers in words; "" for all.
         unit: unit; "1" for none.
         meaning: meaning in a line.
         choices: words or names of tables to choose from; empty without a choice.
@@ -136,10 +137,19 @@ class Setting(NamedTuple):
 
     key: str
     default: str
+    domain: str
     unit: str
     meaning: str
     choices: tuple[str, ...]
     table: bool
+
+
+def describe_domain(meta: msgspec.Meta) -> str:
+    """Describe the bounds of a number; empty without bounds."""
+    if meta.ge is not None and meta.le is not None:
+        return f"{meta.ge} to {meta.le}"
+    bounds = {"at least": meta.ge, "above": meta.gt, "at most": meta.le, "below": meta.lt}
+    return ", ".join(f"{words} {bound}" for words, bound in bounds.items() if bound is not None)
 
 
 def settings_in(kind: type, prefix: str = "") -> list[Setting]:
@@ -156,7 +166,8 @@ def settings_in(kind: type, prefix: str = "") -> list[Setting]:
         default = "" if field.default is msgspec.NODEFAULT or structs else repr(field.default)
         tags = tuple(str(s.__struct_config__.tag) for s in structs if s.__struct_config__.tag is not None)
         choices = tags or tuple(filter(None, words_in(inner)))
-        settings.append(Setting(key, default, meta.extra["unit"], meta.description, choices, bool(structs)))
+        domain = describe_domain(meta)
+        settings.append(Setting(key, default, domain, meta.extra["unit"], meta.description, choices, bool(structs)))
         key += ".0" * many
         for struct in structs:
             label = struct.__struct_config__.tag
@@ -165,12 +176,12 @@ def settings_in(kind: type, prefix: str = "") -> list[Setting]:
 
 
 def describe(kind: type) -> list[str]:
-    """Return one line per setting with key, default, unit and meaning, for ``mivol optimize --settings``."""
+    """Return one line per setting with key, default, unit, meaning and domain, for ``mivol optimize --settings``."""
     lines = []
-    for key, default, unit, meaning, choices, table in settings_in(kind):
+    for key, default, domain, unit, meaning, choices, table in settings_in(kind):
         if not table or choices:
             value = f" = {default}" if default else ""
-            one_of = f" ({' | '.join(choices)})" if choices else ""
+            one_of = f" ({' | '.join(choices) or domain})" if choices or domain else ""
             lines.append(f"{key}{value}{f' [{unit}]' if unit != '1' else ''}: {meaning}{one_of}")
     return lines
 

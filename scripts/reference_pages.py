@@ -145,10 +145,10 @@ def setting_rows(kind: type) -> list[tuple[str, str, str, str]]:
     from mivol.schema import settings_in
 
     rows = []
-    for key, default, unit, meaning, choices, is_table in settings_in(kind):
+    for key, default, domain, unit, meaning, choices, is_table in settings_in(kind):
         named = f": {', '.join(f'`{name}`' for name in choices)}" if choices else ""
         said = f"**{meaning}**" if is_table else meaning
-        rows.append((f"`{key}`", f"`{default}`" if default else "", "" if unit == "1" else unit, said + named))
+        rows.append((f"`{key}`", f"`{default}`" if default else "", domain, "" if unit == "1" else unit, said + named))
     return rows
 
 
@@ -178,7 +178,7 @@ def toml_page() -> str:
     }
     lines = ["# Settings of an experiment", "", *SETTINGS_HEAD.splitlines(), ""]
     for title, kind in kinds.items():
-        lines += [f"## {title}", "", *table(("key", "default", "unit", "meaning"), setting_rows(kind))]
+        lines += [f"## {title}", "", *table(("key", "default", "domain", "unit", "meaning"), setting_rows(kind))]
     return page(lines)
 
 

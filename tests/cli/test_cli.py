@@ -229,7 +229,7 @@ def test_settings_are_listed_by_a_word_in_their_names(capsys: pytest.CaptureFixt
         run("optimize", "--settings", "beta_1")
     heading, line = capsys.readouterr().out.splitlines()
     assert (done.value.code, heading) == (0, "A fit of scene parameters to images: a file with a table [scene]:")
-    assert line == "  optimizer[adam].beta_1 = 0.9: memory of the gradient"
+    assert line == "  optimizer[adam].beta_1 = 0.9: memory of the gradient (at least 0, below 1)"
     with pytest.raises(SystemExit) as done:
         run("optimize", "--settings")
     assert done.value.code == 0 and sum(line[0] != " " for line in capsys.readouterr().out.splitlines()) == len(EXPERIMENTS)

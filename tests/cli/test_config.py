@@ -15,7 +15,7 @@ from mivol import config
 from mivol.errors import MivolError
 from mivol.optim.priors import TotalVariation
 from mivol.optim.second_order import GaussNewton
-from mivol.schema import describe, settings_in, structs_in
+from mivol.schema import describe, describe_domain, settings_in, structs_in
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALLEST = """
@@ -197,3 +197,17 @@ def test_settings_say_what_they_are_chosen_from() -> None:
     assert "(turntable | views | keyframes)" in next(
         line for line in describe(config.FieldExperiment) if line.startswith("show.way")
     )
+
+
+@pytest.mark.parametrize(
+    ("bounds", "said"),
+    [
+        ({}, ""),
+        ({"ge": 0, "le": 4}, "0 to 4"),
+        ({"gt": 0.0, "le": 1.0}, "above 0.0, at most 1.0"),
+        ({"ge": 0, "lt": 1}, "at least 0, below 1"),
+        ({"ge": -1}, "at least -1"),
+    ],
+)
+def test_domains_are_said_in_words(bounds: dict[str, float], said: str) -> None:
+    assert describe_domain(msgspec.Meta(**bounds)) == said
