@@ -5,6 +5,7 @@ paths.
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -152,11 +153,16 @@ def test_branches_walk_side_by_side_by_their_length() -> None:
 
 
 @pytest.mark.parametrize(
-    ("collided", "noise", "count"), [(1000, 0.5, 1), (400, 0.5, 2), (400, 0.03, 1), (100, 0.03, 3), (1, 0.5, 8), (0, 0.5, 8)]
-)
-def test_fewer_collisions_and_more_noise_need_more_branches(collided: int, noise: float, count: int) -> None:
-    """sqrt(26 noise / share), rounded, at most 8; never more branches than stems."""
-    assert int(count_branches(1000, mi.UInt32(collided), mi.Float(noise))[0]) == count
+    ("collided", "noise", "near", "count"),
+    [(1000, 0.5, 0, 1), (400, 0.5, 0, 2), (400, 0.03, 0, 1), (100, 0.03, 0, 3), (1, 0.5, 0, 8), (0, 0.5, 0, 8),
+     (100, 0.5, 0, 8), (100, 0.5, 1, 5), (100, None, 0, 6), (100, None, 1, 3)],
+)  # fmt: skip
+def test_fewer_collisions_and_more_noise_need_more_branches(collided: int, noise: float | None, near: int, count: int) -> None:
+    """sqrt(26 noise / share), or sqrt(5 noise / share) beside near light on segments, rounded, at most 8; a noise of 0.15
+    without a baseline; never more branches than stems."""
+    baseline = None if noise is None else SimpleNamespace(noise=mi.Float(noise))
+    estimators = SimpleNamespace(segment=SimpleNamespace(baseline=baseline), near=near or None)
+    assert int(count_branches(estimators, 1000, mi.UInt32(collided))[0]) == count
     assert count * collided <= 1000
 
 

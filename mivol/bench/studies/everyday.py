@@ -22,7 +22,8 @@ gradients: of the mean of the image, ``mi.render`` and ``dr.backward``, with res
 four times the rounds.
 
 The pixel that shows a point lamp inside a medium has an infinite variance, whatever the integrator, since light falls as 1 / h
-with the distance h of a ray. With 6 rounds, ratios of such scenes scatter by 10 times from run to run; use ``--rounds 24``.
+with the distance h of a ray. So have gradients of ``prbvolpath`` beside such a lamp. With 6 rounds, ratios of such scenes
+scatter by 10 times from run to run; use ``--rounds 24``.
 
 Conventions. z is up. The medium fills the shape ``body``, in most scenes the box or ball of edge or diameter 2 at the origin.
 Coefficients are in 1 / length. Each scene has the ``max_depth`` that its light needs.
