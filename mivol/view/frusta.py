@@ -29,7 +29,7 @@ MOST = 300
 EDGE = 160
 """Longest edge of a photograph in its frustum [pixel]."""
 
-SIZE = 0.1, 0.4
+SIZE = 0.05, 0.4
 """Depth of a frustum at most: over the median distance of cameras from the middle of the photographs' box, and over the median
 distance of neighbouring cameras."""
 

@@ -243,9 +243,9 @@ class Page:
         view, camera = self.subject.first_view(), self.server.initial_camera
         aspect, origin = view.size[0] / view.size[1], np.array(view.origin)
         if self.subject.survey is not None:
-            # Before the photograph that stands there, which would hide the model.
+            # Before the photographs that stand there and beside, which would hide the model.
             ahead = view.target - origin
-            origin += 1.2 * frustum_size(self.subject.survey) * ahead / np.linalg.norm(ahead)
+            origin += 3 * frustum_size(self.subject.survey) * ahead / np.linalg.norm(ahead)
         camera.position, camera.look_at, camera.up = origin, view.target, view.up
         camera.fov = 2 * np.arctan(np.tan(np.radians(view.fov) / 2) / aspect)
         self.server.scene.set_up_direction(view.up)

@@ -279,35 +279,32 @@ class SceneSubject(Subject):
             self.box = np.array([[-1.0] * 3, [1.0] * 3])
         sensors = [sensor for sensor in self.scene.sensors() if sensor.class_name() == "PerspectiveCamera"]
         self.home = find_home_view([to_camera(sensors[0])], self.box) if sensors else None
-        if self.home is not None and (target := find_target(path, self.home)) is not None:
-            self.home = replace(self.home, target=target)
+        if self.home is not None:
+            self.home = follow_lookat(path, self.home)
 
     def draw(self, camera: Camera, look: Look, seed: int = 0) -> np.ndarray:
         sensor = mi.load_dict(to_sensor(camera))
         return np.array(self.integrator.render(self.scene, sensor, seed=seed, spp=1))[..., :3]
 
 
-def find_target(path: Path, home: HomeView) -> tuple[float, ...] | None:
-    """Return the point (3,) at which a ``lookat`` of a scene in XML aims the camera of its first view [length].
+def follow_lookat(path: Path, home: HomeView) -> HomeView:
+    """Return the first view of a scene with target and up of a ``lookat`` in its XML, or as it is without one for this camera.
 
-    The middle of a scene with a far background lies far from what the camera shows, and drags turn about this point.
-
-    Returns:
-        None for a scene without such a ``lookat``, as of a camera placed by other transforms.
+    Drags turn about both. The middle of a scene with a far background is far from what the camera shows, and the camera's own
+    up leans back if it looks down.
     """
     try:
         looks = list(ElementTree.parse(path).getroot().iterfind("sensor/transform/lookat")) if path.suffix == ".xml" else []
     except ElementTree.ParseError:
-        return None
+        return home
     for look in looks:
-        words = look.get("target", "").replace(",", " ").split()
         with suppress(ValueError):
-            ahead = np.subtract([float(word) for word in words], home.origin)
-            forward = np.subtract(home.target, home.origin)
+            target, up = (np.array(look.get(key, "").replace(",", " ").split(), float) for key in ("target", "up"))
+            ahead, forward = target - home.origin, np.subtract(home.target, home.origin)
             # Off by 1e-3 of the distance at most: Mitsuba holds the transform in single precision.
-            if ahead.shape == (3,) and ahead @ forward > 0 and _sine(ahead, forward) < 1e-3:
-                return tuple((home.origin + ahead).tolist())
-    return None
+            if up.shape == (3,) and ahead @ forward > 0 and _sine(ahead, forward) < 1e-3:
+                return replace(home, target=tuple(target.tolist()), up=tuple((up / np.linalg.norm(up)).tolist()))
+    return home
 
 
 def _sine(a: np.ndarray, b: np.ndarray) -> float:

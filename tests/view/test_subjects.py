@@ -130,7 +130,7 @@ def test_foreign_paths_are_refused_in_a_sentence(tmp_path: Path) -> None:
         assert_refused(word, open_subject, tmp_path / name)
 
 
-LOOKAT = '<lookat origin="0,-4,0" target="0, 1 0.5" up="0 0 1"/>'
+LOOKAT = '<lookat origin="0,-4,0" target="0, 1 0.5" up="0 0 2"/>'
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ LOOKAT = '<lookat origin="0,-4,0" target="0, 1 0.5" up="0 0 1"/>'
     ],
 )
 def test_a_scene_turns_about_what_its_camera_looks_at(variant_rgb: str, tmp_path: Path, transform: str, is_aimed: bool) -> None:
-    """The target is 5 and 0.5 away; the middle of the scene, a ball of radius 100 around (90, 0, 0), is elsewhere."""
+    """The target is 5 and 0.5 away, so the camera's own up leans back; the middle of the scene is that of a ball far away."""
     path = tmp_path / "scene.xml"
     sensor = f'<sensor type="perspective"><transform name="to_world">{transform}</transform></sensor>'
     ball = '<shape type="sphere"><float name="radius" value="100"/><point name="center" x="90" y="0" z="0"/></shape>'
@@ -152,3 +152,4 @@ def test_a_scene_turns_about_what_its_camera_looks_at(variant_rgb: str, tmp_path
     reach = np.linalg.norm(ahead)
     assert (reach == pytest.approx(25.25**0.5, rel=1e-6)) == is_aimed
     np.testing.assert_allclose(ahead / reach, to_camera(subject.scene.sensors()[0]).forward, atol=1e-5)
+    assert (subject.home.up == (0, 0, 1)) == is_aimed
