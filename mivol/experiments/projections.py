@@ -150,7 +150,7 @@ def check_data(settings: config.ScanExperiment, data: Projections, grid: VoxelGr
     """Check measured projections against the grid, and note rows that are upside down.
 
     Raises:
-        MivolError: rays that all miss the grid.
+        MivolError: as :func:`check_hits`.
     """
     check_hits(Projector(data.geometry, grid))
     return replace(data, notes=(*data.notes, *note_rows(settings.data, data.geometry, grid, data.y, data.weights)))
@@ -169,18 +169,26 @@ def check_rays(settings: config.ScanExperiment) -> None:
 
 
 def check_hits(projector: Projector) -> None:
-    """Refuse a scan whose rays all miss the grid, by up to eight of its views.
+    """Refuse a scan whose source is inside the grid, or whose rays all miss the grid, by up to eight of its views.
 
     Raises:
         MivolError: with the extent of the grid.
     """
+    grid, geometry = projector.grid, projector.geometry
+    advice = "give all lengths of scan and grid in one unit, and check distances, offsets and grid.centre."
+    if not geometry.whole_lines:
+        distance = np.abs(geometry.panels().source - grid.centre)
+        inside = (distance < np.divide(grid.extent, 2)).all(axis=1)
+        if inside.any():
+            raise MivolError(
+                f"the source of view {inside.argmax()} is inside the grid, whose edges are "
+                f"{tuple(round(edge, 4) for edge in grid.extent.tolist())}: {advice}"
+            )
     some = projector.subset(np.unique(np.linspace(0, projector.n_views - 1, 8).astype(int)))
     if (some @ np.ones(projector.grid.shape, np.float32)).any():
         return
-    grid = projector.grid
     raise MivolError(
-        f"no ray meets the grid, which reaches {grid.radius:.4g} from {tuple(round(c, 4) for c in grid.centre)}: give all "
-        "lengths of scan and grid in one unit, and check distances, offsets and grid.centre."
+        f"no ray meets the grid, which reaches {grid.radius:.4g} from {tuple(round(c, 4) for c in grid.centre)}: {advice}"
     )
 
 

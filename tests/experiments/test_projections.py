@@ -72,7 +72,7 @@ def test_some_ray_must_meet_the_grid(views: int, asked: list[int], seen: float) 
     chosen = []
 
     class Projector:
-        grid, n_views = FakeGrid, views
+        grid, n_views, geometry = FakeGrid, views, SimpleNamespace(whole_lines=True)
 
         def subset(self, some: np.ndarray) -> Projector:
             chosen.extend(some.tolist())

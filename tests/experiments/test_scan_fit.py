@@ -505,6 +505,10 @@ REFUSED = {
     "volume that is not there": (['data={source="volume", file="none.npz"}'], "none.npz"),
     "volume of another shape": (['data={source="volume", file="v.npz"}'], "make them equal"),
     "grid that no ray meets": (["grid.centre=[0,0,400]"], "no ray meets the grid, which reaches 1.732 from (0.0, 0.0, 400.0)"),
+    "source among the voxels": (
+        ["scan.source_to_axis=0.5"],
+        "the source of view 0 is inside the grid, whose edges are (2.0, 2.0, 2.0): give all lengths of scan and grid in one unit",
+    ),
     "stack that is not there": (['data={source="stack", file="a.npy", reading="line_integral"}'], "a.npy"),
     "intensity alone": (['data={source="stack", file="a.npy", reading="intensity"}'], "an intensity needs flats"),
     "stack with a hole": (
