@@ -507,7 +507,7 @@ REFUSED = {
     "grid that no ray meets": (["grid.centre=[0,0,400]"], "no ray meets the grid, which reaches 1.732 from (0.0, 0.0, 400.0)"),
     "source among the voxels": (
         ["scan.source_to_axis=0.5"],
-        "the source of view 0 is inside the grid, whose edges are (2.0, 2.0, 2.0): give all lengths of scan and grid in one unit",
+        "the source of view 0 is inside the grid, whose edges are (2.0, 2.0, 2.0): give all lengths",
     ),
     "stack that is not there": (['data={source="stack", file="a.npy", reading="line_integral"}'], "a.npy"),
     "intensity alone": (['data={source="stack", file="a.npy", reading="intensity"}'], "an intensity needs flats"),
