@@ -15,7 +15,7 @@ from refusals import assert_refused
 
 from mivol.bench.harness.contests import Contest, Timing
 from mivol.bench.studies import everyday
-from mivol.bench.studies.everyday import SCENES, STUDY, EverydaySize, measure_gradients, measure_images
+from mivol.bench.studies.everyday import MITSUBAS_SCENES, SCENES, STUDY, EverydaySize, measure_gradients, measure_images
 
 TINY = replace(EverydaySize.quick(), scenes=("jade_null_sun",), side=2, spp=4, rounds=4)
 
@@ -35,6 +35,24 @@ def test_every_scene_has_its_parameter(variant_rgb: str, name: str) -> None:
     assert SCENES[name].parameter in params
     # Differentiable, so a gradient exists.
     assert params.flags(SCENES[name].parameter) & mi.ParamFlags.NonDifferentiable == 0
+
+
+@pytest.mark.slow_for(*list(MITSUBAS_SCENES)[2:])
+@pytest.mark.parametrize("name", MITSUBAS_SCENES)
+def test_scenes_of_mitsubas_tests_have_their_size_sampler_and_parameter(
+    two_threads: None, data_dir: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setattr(everyday, "DATA", data_dir)
+    scene = MITSUBAS_SCENES[name].load(7, "multijitter", 9)
+    sensor = scene.sensors()[0]
+    assert MITSUBAS_SCENES[name].parameter in mi.traverse(scene)
+    assert tuple(sensor.film().size()) == (7, 7) and sensor.sampler().sample_count() == 9
+    assert sensor.sampler().class_name() == "MultijitterSampler"
+
+
+def test_a_missing_scene_of_mitsubas_tests_is_named(variant_rgb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(everyday, "DATA", tmp_path)
+    assert_refused("set MIVOL_DATA to the folder that holds", MITSUBAS_SCENES["object_albedo"].load, 7)
 
 
 def test_images_are_compared_with_the_better_sampler(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:

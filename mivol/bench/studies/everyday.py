@@ -4,6 +4,8 @@
     mivol bench everyday --quick                             # 5 minutes, small images: do the means agree?
     mivol bench everyday --scenes tissue god_rays            # some of the scenes
     mivol bench everyday --only images --side 48 --spp 16    # a smaller question
+    mivol bench everyday --only gradients --side 48 --gradient-spp 32 --scenes area_light_albedo area_light_sigma_t \
+        object_albedo object_sigma_t null_envmap_albedo null_envmap_sigma_t hetero_albedo hetero_sigma_t
 
 Fifteen scenes: homogeneous and varying media in rooms, over floors, in glass and
 in fog, with lamps inside and beside, each at the depth that its light needs. All methods take the same samples per pixel and
@@ -24,6 +26,8 @@ four times the rounds.
 The pixel that shows a point lamp inside a medium has an infinite variance, whatever the integrator, since light falls as 1 / h
 with the distance h of a ray. So have gradients of ``prbvolpath`` beside such a lamp. With 6 rounds, ratios of such scenes
 scatter by 10 times from run to run; use ``--rounds 24``.
+
+The last command has four scenes of Mitsuba's own tests, read from MIVOL_DATA, each with the parameter in its name.
 
 Conventions. z is up. The medium fills the shape ``body``, in most scenes the box or ball of edge or diameter 2 at the origin.
 Coefficients are in 1 / length. Each scene has the ``max_depth`` that its light needs.
@@ -53,10 +57,11 @@ from mivol.bench.harness.contests import (
 )
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
 from mivol.bench.harness.study import AT_LEAST, Bar, Promise, Size, Study, amount, judge_agreement, say_row
-from mivol.bench.scenes import ParameterGradient, camera, make_integrator
+from mivol.bench.scenes import DATA, ParameterGradient, camera, make_integrator
 from mivol.errors import MivolError
 from mivol.optim.strategy import suggest_name
 from mivol.report.figures import SERIES
+from mivol.scene.load import resolve_beside
 
 ORIGIN, UP = (0, 0, 0), (0, 0, 1)
 
@@ -66,7 +71,7 @@ class EverydayScene:
     """A scene and the terms of its contest.
 
     Attributes:
-        build: side of the image -> parts of the scene.
+        build: side of the image -> parts of the scene; or the name of a scene of Mitsuba's own tests.
         depth: ``max_depth`` of all integrators; -1: unlimited.
         image_bar: smallest ratio of variance x time for images.
         gradient_bar: the same for gradients; None: no bar.
@@ -74,7 +79,7 @@ class EverydayScene:
         roulette: depth at which Russian roulette begins.
     """
 
-    build: Callable[[int], dict]
+    build: Callable[[int], dict] | str
     depth: int
     image_bar: float
     gradient_bar: float | None
@@ -83,6 +88,8 @@ class EverydayScene:
 
     def load(self, side: int, sampler: str = "independent", spp: int = 1) -> mi.Scene:
         """Load the scene with a sampler for ``spp`` samples per pixel."""
+        if isinstance(self.build, str):
+            return _load_test_scene(self.build, side, sampler, spp)
         parts = self.build(side)
         parts["sensor"]["sampler"] = {"type": sampler, "sample_count": spp}
         return mi.load_dict({"type": "scene", **parts})
@@ -90,6 +97,29 @@ class EverydayScene:
     def integrator(self, name: str) -> mi.Integrator:
         """An integrator for this scene alone."""
         return make_integrator(name, self.depth, roulette=self.roulette)
+
+
+TESTS = "scenes/mitsuba-data/tests/scenes/participating_media"
+"""Folder of Mitsuba's own scenes with media, below MIVOL_DATA."""
+
+
+def _load_test_scene(name: str, side: int, sampler: str, spp: int) -> mi.Scene:
+    """Load a scene of Mitsuba's own tests.
+
+    Raises:
+        MivolError: the scene is missing.
+    """
+    path = DATA / TESTS / f"test_{name}_volpath.xml"
+    if not path.is_file():
+        raise MivolError(f"{path} is missing: set MIVOL_DATA to the folder that holds {TESTS}.")
+    config = mi.parser.ParserConfig(mi.variant())
+    with resolve_beside(path):
+        state = mi.parser.parse_file(config, str(path), res=str(side), spp=str(spp))
+        for node in state.nodes:
+            if node.props.plugin_name() == "independent":
+                node.props.set_plugin_name(sampler)
+        mi.parser.transform_all(config, state)
+        return mi.parser.instantiate(config, state)
 
 
 # -- Parts ------------------------------------------------------------------------------------------------------------------
@@ -286,6 +316,18 @@ SCENES = {
 }
 """The scenes by name."""
 
+MITSUBAS_SCENES = {
+    f"{scene}_{coefficient}": EverydayScene(file, 6, 1.5, 2, f"medium1.{coefficient}.{values}", roulette=5)
+    for scene, file, extinction in (
+        ("area_light", "homo_area_light", "value.value"),
+        ("object", "homo_obj_inside_medium", "value.value"),
+        ("null_envmap", "homo_null_envmap", "value.value"),
+        ("hetero", "hetero_sigmat", "data"),
+    )
+    for coefficient, values in (("albedo", "value.value"), ("sigma_t", extinction))
+}
+"""Scenes of Mitsuba's own tests, with the parameters of their gradients: measured on demand."""
+
 
 # -- The contest -------------------------------------------------------------------------------------------------------
 
@@ -318,10 +360,11 @@ def chosen_scenes(names: Sequence[str]) -> dict[str, EverydayScene]:
     Raises:
         MivolError: an unknown scene.
     """
+    known = SCENES | MITSUBAS_SCENES
     for name in names:
-        if name not in SCENES:
-            raise MivolError(f'there is no scene "{name}": {suggest_name(name, SCENES)}')
-    return {name: SCENES[name] for name in names}
+        if name not in known:
+            raise MivolError(f'there is no scene "{name}": {suggest_name(name, known)}')
+    return {name: known[name] for name in names}
 
 
 def measure_images(size: EverydaySize) -> dict:
@@ -423,8 +466,8 @@ def promise(question: str, bars: dict[str, float | None], mean: float) -> list[P
 
 
 PROMISES = {
-    "images": promise("images", {name: scene.image_bar for name, scene in SCENES.items()}, 8),
-    "gradients": promise("gradients", {name: scene.gradient_bar for name, scene in SCENES.items()}, 5),
+    "images": promise("images", {name: scene.image_bar for name, scene in (SCENES | MITSUBAS_SCENES).items()}, 8),
+    "gradients": promise("gradients", {name: scene.gradient_bar for name, scene in (SCENES | MITSUBAS_SCENES).items()}, 5),
 }
 
 
