@@ -640,3 +640,8 @@ def test_every_part_of_a_record_is_on_the_page(tmp_path: Path) -> None:
         *("load | 500 ms | fit | 90 s | judge | 8", "mivol optimize it.toml"),
     ):
         assert part in said
+
+
+@pytest.mark.parametrize(("value", "said"), [(None, "–"), (12345.0, "12,345"), (0.123456, "0.123")])
+def test_whole_results_have_all_digits_and_others_three(value: float | None, said: str) -> None:
+    assert page_module._result_tile("iterations", value, {})[0] == said
