@@ -4,6 +4,7 @@
     scripts/on_a_gpu --only tests steps       some of the parts
     scripts/on_a_gpu --only samples chair_hash chair_nerf      hash grids and NeRFs, within 16 minutes more
     scripts/on_a_gpu --variant llvm_ad_rgb    the same parts on the processor
+    scripts/on_a_gpu --variant llvm_ad_rgb --quick --only samples chair_hash chair_nerf     a rehearsal in a minute
 
 Each part is a process of its own with a limit of time, so that a part that fails, waits or kills its process costs the others
 nothing. What was printed lies in the folder as PART.log. Fits need public data (``mivol fetch chair``); without it they are
@@ -96,6 +97,8 @@ PARTS = (
 """The parts in their order. The limits of those that run without being named sum to 12 minutes, of the others to 16."""
 
 
+QUICK = "; a rehearsal in small sizes, whose figures mean nothing"
+
 LAST_LINES = 3
 """Lines kept of a part without a table."""
 
@@ -117,14 +120,15 @@ class Result:
     lines: list[str] = field(default_factory=list)
 
 
-def run_part(part: Part, variant: str, out: Path) -> Result:
-    """Run a part, and keep what it prints in a file."""
+def run_part(part: Part, variant: str, out: Path, quick: bool = False) -> Result:
+    """Run a part, and keep what it prints in a file; ``quick``: studies in the small sizes of a rehearsal."""
     if part.needs and not (data_folder() / part.needs).is_dir():
         return Result(part.name, "left out", lines=[f"{part.needs} was not found in {data_folder()}: set MIVOL_DATA"])
-    log, start = out / f"{part.name}.log", time.perf_counter()
+    log, start, command = out / f"{part.name}.log", time.perf_counter(), part.command(variant, out)
+    command += ["--quick"] if quick and "bench" in command else []
     with log.open("w") as file:
         child = subprocess.Popen(
-            [sys.executable, *part.command(variant, out)],
+            [sys.executable, *command],
             stdout=file,
             stderr=subprocess.STDOUT,
             cwd=ROOT,
@@ -144,14 +148,14 @@ def run_part(part: Part, variant: str, out: Path) -> Result:
     return Result(part.name, state, time.perf_counter() - start, tables or [line.strip() for line in said[-LAST_LINES:]])
 
 
-def write_report(results: Sequence[Result], variant: str, out: Path) -> str:
+def write_report(results: Sequence[Result], variant: str, out: Path, quick: bool = False) -> str:
     """Write ``report.json`` and ``report.md``; return the text of the latter."""
     gpus = [asdict(gpu) for gpu in list_gpus()]
     date = time.strftime("%Y-%m-%d")
     told = {"variant": variant, "date": date, "gpus": gpus, "parts": [asdict(result) for result in results]}
     (out / "report.json").write_text(json.dumps(told, indent=1))
     lines = [
-        f"{variant}: {', '.join(gpu['name'] for gpu in gpus) or 'no GPU'}, {date}",
+        f"{variant}: {', '.join(gpu['name'] for gpu in gpus) or 'no GPU'}, {date}{QUICK if quick else ''}",
         "",
         "| part | state | time [s] |",
         "|---|---|---|",
@@ -170,6 +174,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--variant", default="cuda_ad_rgb", help="variant of Mitsuba (cuda_ad_rgb)")
     parser.add_argument("--only", nargs="+", choices=[part.name for part in PARTS], metavar="PART", help="run these parts only")
     parser.add_argument("--out", type=Path, default=ROOT / "runs" / "on_a_gpu", help="folder of results (runs/on_a_gpu)")
+    parser.add_argument("--quick", action="store_true", help="a rehearsal: studies in small sizes, whose figures mean nothing")
     args = parser.parse_args(argv)
     if args.variant.startswith("cuda") and not list_gpus():
         parser.error("nvidia-smi finds no NVIDIA GPU here: install its driver, or give --variant llvm_ad_rgb.")
@@ -177,10 +182,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     results = []
     for part in PARTS:
         if part.name in args.only if args.only else not part.is_more:
-            results.append(run_part(part, args.variant, args.out))
+            results.append(run_part(part, args.variant, args.out, args.quick))
             print(f"{part.name}: {results[-1].state} in {results[-1].seconds:.0f} s", flush=True)
             # Also after a part, in case the machine goes away.
-            text = write_report(results, args.variant, args.out)
+            text = write_report(results, args.variant, args.out, args.quick)
     print(f"\n{text}\n{args.out / 'report.json'}")
     return int(any(result.state in ("failed", "out of time") for result in results))
 

@@ -44,6 +44,18 @@ def test_parts_are_run_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
     assert [found["name"] for found in json.loads((tmp_path / "report.json").read_text())["parts"]] == ["long"]
 
 
+def test_a_rehearsal_asks_studies_for_small_sizes_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    echo = "import sys; print('|', *sys.argv[1:], '|')"
+    parts = [report.Part(name, 60, lambda variant, out, name=name: ["-c", echo, name]) for name in ("bench", "tests")]
+    monkeypatch.setattr(report, "PARTS", parts)
+    monkeypatch.setattr(report, "list_gpus", list)
+    assert report.main(["--variant", "llvm_ad_rgb", "--out", str(tmp_path), "--quick"]) == 0
+    said = capsys.readouterr().out
+    assert "| bench --quick |" in said and "| tests |" in said and "no GPU" in said and "figures mean nothing" in said
+
+
 def test_a_machine_without_a_gpu(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(report, "list_gpus", list)
     with pytest.raises(SystemExit):
