@@ -97,6 +97,13 @@ def check_quadrature(needs: Needs, settings: Settings) -> None:
             f"deterministic is set and the scene has a {other[0]}; quadrature is for emitters of one position or direction "
             "(point, spot, directional): leave deterministic out."
         )
+    further = [f"{medium.name} emits light too" for medium in needs.media if medium.emits]
+    further += [f"the boundary {name} refracts light" for name in needs.refractive]
+    if further:
+        raise MivolError(
+            f"deterministic is set, a medium scatters and {further[0]}; quadrature is for a medium that only scatters the "
+            "light of emitters outside of refracting boundaries: leave deterministic out."
+        )
     if len(needs.media) > 1 or not shares_cells(needs.views[0].by_quadrature()):
         medium, found = needs.media[0], f"the scene has {len(needs.media)} media"
         if len(needs.media) == 1:

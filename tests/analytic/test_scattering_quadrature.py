@@ -133,6 +133,16 @@ def test_refusals():
         scene = close_up({"smoke": box_of({"type": "mivol_medium", **given}, PLACE), "emitter": emitter})
         with refused(why):
             mi.render(scene, integrator=mi.load_dict(mivol(deterministic=True, **more)), spp=1)
+    glowing = box_of({"type": "mivol_medium", "sigma_t": 1.0, "albedo": 0.5, "emission": 0.5}, PLACE)
+    behind_glass = box | {"bsdf": {"type": "dielectric"}}
+    for inside, why in (
+        (glowing, "smoke emits light too"),
+        (behind_glass, r"the boundary smoke \(SmoothDielectric\) refracts"),
+    ):
+        with refused(why):
+            mi.render(
+                close_up({"smoke": inside, "emitter": emitter}), integrator=mi.load_dict(mivol(deterministic=True)), spp=1
+            )
     with refused("estimated or grid"):
         mi.render(close_up({"smoke": box, "emitter": emitter}), integrator=mi.load_dict(mivol(shadows="soft")), spp=1)
 
