@@ -6,7 +6,7 @@ Conventions. The facts come first, even for a refused scene. A refusal is the la
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -91,7 +91,9 @@ def explain_scene(
         Facts and choices with their reasons, and a refusal separately.
     """
     eye = find_sensor(scene, sensor)
-    settings = read_settings(scene) if max_depth is None else Settings(**describe_light(scene, max_depth))
+    settings = read_settings(scene)
+    if max_depth is not None:
+        settings = replace(settings, max_depth=max_depth)
     try:
         survey = survey_scene(scene)
         needs = find_needs(scene, eye, survey, reads_emission=settings.may_draw_emission)

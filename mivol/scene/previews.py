@@ -130,7 +130,7 @@ def find_sufficient_depth(scene: mi.Scene, sensor: mi.Sensor, settings: Settings
     Args:
         scene: the complete scene.
         sensor: a sensor of the scene, or another sensor.
-        settings: settings of the integrator; the depth is ignored.
+        settings: settings of the integrator; its depth and its quadrature are ignored.
         noise: requested noise of a pixel over the mean radiance [1].
 
     Raises:
@@ -139,8 +139,8 @@ def find_sufficient_depth(scene: mi.Scene, sensor: mi.Sensor, settings: Settings
     Cost: half a million paths, and one kernel per depth.
     """
     with dr.suspend_grad():
-        survey = survey_scene(scene)
-        seen = [_render_depth_preview(scene, sensor, survey, replace(settings, max_depth=depth)) for depth in DEPTHS]
+        survey, drawn = survey_scene(scene), replace(settings, deterministic=False, shadows="auto")
+        seen = [_render_depth_preview(scene, sensor, survey, replace(drawn, max_depth=depth)) for depth in DEPTHS]
     return SufficientDepth(
         tuple(measure_depth_error(depth, some, seen[-1]) for depth, some in zip(DEPTHS, seen[:-1], strict=False)), noise
     )

@@ -74,3 +74,20 @@ def test_what_is_not_recorded_is_traced_with_its_reason(monkeypatch: pytest.Monk
         found = choose_recording(None, None, None, None, for_images)
         assert found.subject == subject and found.choice.startswith(choice)
         assert found.reason == (unrecorded or "a recording follows values, cameras and seeds that change between calls")
+
+
+@pytest.mark.parametrize("volume", ["grid", "hash grid"])
+def test_quadrature_is_explained_with_the_depth_that_it_leaves_out(volume: str) -> None:
+    """Previews of other depths draw light; another depth keeps the other settings."""
+    sigma_t = {"type": "mivol_hash", "majorant": 3.0, "levels": 2, "finest": 6, "log2_table": 8}
+    if volume == "grid":
+        sigma_t = grid_volume("mivol_voxels", np.full((2, 2, 2, 1), 1.5), np.eye(4))
+    integrator = {"type": "mivol", "max_depth": 2, "deterministic": True}
+    scene = mi.load_dict(
+        {"type": "scene", "integrator": integrator, "sensor": camera((0.5, -2, 0.6), (0.5, 0.5, 0.5), 4, 16)}
+        | {"lamp": {"type": "point", "position": [2, -1, 2]}, "box": box_of(medium("mivol_medium", sigma_t, 0.5), np.eye(4))}
+    )
+    text = explain(scene, noise=0.05)
+    assert "one scattering by quadrature" in text and "depth 2 leaves out" in text and "refused" not in text
+    assert ("two points in each half of a cell" in text) == (volume == "hash grid")
+    assert "max_depth is 4; quadrature is for a single scattering" in explain(scene, max_depth=4)

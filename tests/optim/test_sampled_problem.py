@@ -67,13 +67,14 @@ def test_the_gradient_is_the_slope_of_the_loss(variant_rgb: str, photos: list[Ph
         assert float((along * np.array(gradient[name])).sum()) == pytest.approx(slope, rel=0.02, abs=2.0**-22 / h)
 
 
-def test_a_resumed_fit_equals_an_uninterrupted_fit(one_thread, photos: list[Photo], tmp_path: Path) -> None:
+@pytest.mark.parametrize("precision", ["single", "half"])
+def test_a_resumed_fit_equals_an_uninterrupted_fit(one_thread, photos: list[Photo], tmp_path: Path, precision: str) -> None:
     """Values, moments and losses, to the last bit with one thread; the map of occupied cells is among what is kept."""
-    path = tmp_path / "checkpoint.npz"
-    whole = taken(begin(photos, store=CheckpointFile(path, {})), 5)
+    path, plan = tmp_path / "checkpoint.npz", replace(PLAN, precision=precision)
+    whole = taken(begin(photos, plan, store=CheckpointFile(path, {})), 5)
     whole.save()
     whole = taken(whole, 8)
-    resumed = begin(photos, store=CheckpointFile(path, {}, resume=True))
+    resumed = begin(photos, plan, store=CheckpointFile(path, {}, resume=True))
     assert resumed.next_iteration == 5
     resumed = taken(resumed, 8)
     kept, found = whole.run.pack(), resumed.run.pack()
