@@ -369,7 +369,7 @@ def correct_rings(y: np.ndarray, weights: np.ndarray, data: config.Readings) -> 
         data: ``rings`` and ``ring_width`` count.
 
     Returns:
-        The line integrals, the same array without ring removal; notes.
+        The line integrals, the same array if nothing is removed; notes.
 
     Raises:
         MivolError: as :func:`mivol.tomography.rings.remove_rings`.
@@ -380,6 +380,8 @@ def correct_rings(y: np.ndarray, weights: np.ndarray, data: config.Readings) -> 
     method, width = ("gain", FIRST_WIDTH) if data.rings == "fit" else (data.rings, RING_WIDTHS[data.rings])
     width = width if data.ring_width is None else data.ring_width
     found = remove_rings(y, weights, method, width)
+    if np.array_equal(found, y):
+        return y, [f'no rings above chance: nothing is removed (data.rings = "{data.rings}")']
     size = float(np.sqrt(np.mean((y - found) ** 2)))
     said = f'ring removal (data.rings = "{data.rings}", {width} columns) changed the line integrals by {size:.2g} (RMS)'
     return found, [said]

@@ -111,7 +111,7 @@ class ScanFit(FitKind):
             say(f"  data      {note}")
         self.record.notes += self.data.notes
         say(f"  held out  {len(self.held_out)} views")
-        has_gains = getattr(self.settings.data, "rings", "none") == "fit"
+        has_gains = fits_gains(self.settings, self.data)
         may_be_direct = not (has_gains or getattr(self.settings.data, "drift", 0))
         walk = Projector(self.data.geometry, grid, self.kept)
         iterations = GAIN_ITERATIONS if has_gains else ITERATIONS
@@ -255,7 +255,7 @@ def make_problem(settings: config.ScanExperiment, a: Projector, data: Projection
     dr.flush_malloc_cache()
     if ALL_SOLVERS[solve.name].problem is LeastSquares:
         weights = data.weights[kept]
-        gains = PixelGains(weights) if getattr(settings.data, "rings", "none") == "fit" else None
+        gains = PixelGains(weights) if fits_gains(settings, data) else None
         least_squares = LeastSquares(a, data.y[kept], weights, x0, solve.nonnegative, prior, gains)
         drift = DriftFit(view_times(data)[kept]) if getattr(settings.data, "drift", 0) else None
         return ProjectionProblem(least_squares, light=drift)
@@ -263,6 +263,11 @@ def make_problem(settings: config.ScanExperiment, a: Projector, data: Projection
         raise MivolError("ml-tr needs counts of quanta, found line integrals: simulate with photons, or choose pcg.")
     quanta = data.quanta.select_views(kept)
     return ProjectionProblem(PoissonCounts(a, quanta.counts, quanta.blank, quanta.background, x0, prior, quanta.used))
+
+
+def fits_gains(settings: config.ScanExperiment, data: Projections) -> bool:
+    """Whether gains of the pixels are unknowns of the fit: as asked, if the scan has rings."""
+    return getattr(settings.data, "rings", "none") == "fit" and data.removed_rings is not None
 
 
 def view_times(data: Projections) -> np.ndarray:

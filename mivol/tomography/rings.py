@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.sparse import diags_array, eye_array
 from scipy.sparse.linalg import splu, spsolve
 
@@ -29,6 +29,16 @@ EDGE_BEND = 5.0
 """Bend of an edge of the object, over the robust standard deviation of all bends."""
 
 
+ARCS, FEWEST_ARCS, VIEWS_OF_ARC = 9, 3, 16
+"""Arcs of successive views that tell gains from the object: at most, at least, and the fewest views of an arc."""
+
+GAIN_DEVIATIONS = 3.0
+"""Standard errors above which gains count as found; scans without rings have up to 1.6."""
+
+ERROR_COLUMNS = 5
+"""Columns over which the variance of an offset's error is averaged."""
+
+
 def remove_rings(y: np.ndarray, weights: np.ndarray, method: str, width: int) -> np.ndarray:
     r"""Remove steps between columns, such as of pixels whose gain the flats do not have: they make rings in the slices.
 
@@ -43,6 +53,9 @@ def remove_rings(y: np.ndarray, weights: np.ndarray, method: str, width: int) ->
 
     because an object bends little between columns. The sum leaves out edges, whose bends exceed ``EDGE_BEND`` deviations of all
     bends. About half of a gain with a period of w along the detector is removed, and more of a shorter one.
+
+    With 48 views or more, o is also found in arcs of the scan. A gain is the same in all arcs; details of the object move. So o
+    is reduced to its share on which the arcs agree, and to 0 in a row whose arcs agree only by chance (empirical Bayes).
 
     ``"sort"`` replaces the value of rank k by the median of :math:`s_{k,\cdot}` over w columns; the outermost column continues
     beyond the edges.
@@ -78,6 +91,32 @@ def remove_rings(y: np.ndarray, weights: np.ndarray, method: str, width: int) ->
 
 def _subtract_gains(y: np.ndarray, width: int) -> np.ndarray:
     """A row (views, cols) without the steps of constant gains."""
+    offsets, arcs = _find_offsets(y, width), min(ARCS, len(y) // VIEWS_OF_ARC)
+    if arcs >= FEWEST_ARCS:
+        offsets *= _share_of_gains(np.stack([_find_offsets(part, width) for part in np.array_split(y, arcs)]))
+    return y - offsets
+
+
+def _share_of_gains(offsets: np.ndarray) -> np.ndarray | float:
+    """Share of each column's offset that gains explain, from its offsets in arcs of the scan (arcs, cols).
+
+    A gain is the same in all arcs; a detail of the object moves to other columns. So the variance of gains is the mean square of
+    the columns' mean offsets, less the variance of the means between arcs. The best linear estimate of a gain is its offset
+    times ``gains / (gains + errors)``.
+
+    Returns:
+        (cols,); 0 if the gains do not exceed ``GAIN_DEVIATIONS`` standard errors.
+    """
+    squares, errors = np.mean(offsets, axis=0) ** 2, np.var(offsets, axis=0, ddof=1) / len(offsets)
+    excess = squares - errors
+    gains = excess.mean()
+    if gains <= GAIN_DEVIATIONS * excess.std() / np.sqrt(len(excess)):
+        return 0.0
+    return gains / (gains + uniform_filter1d(errors, ERROR_COLUMNS, mode="nearest"))
+
+
+def _find_offsets(y: np.ndarray, width: int) -> np.ndarray:
+    """The offsets (cols,) of constant gains in a row (views, cols)."""
     ranked, columns = np.sort(y, axis=0), y.shape[1]
     steps = np.median(ranked - median_filter(ranked, (1, width // 4 | 1), mode="nearest"), axis=0)
     # One number a column changes no rank.
@@ -86,7 +125,7 @@ def _subtract_gains(y: np.ndarray, width: int) -> np.ndarray:
     is_smooth = np.abs(bend) <= EDGE_BEND * 1.4826 * np.median(np.abs(bend))
     second = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(columns - 2, columns)).tocsr()[is_smooth]
     normal = eye_array(columns) + (width / (2 * np.pi)) ** 4 * second.T @ second
-    return y - steps - spsolve(normal.tocsc(), (width / (2 * np.pi)) ** 4 * (second.T @ bend[is_smooth]))
+    return steps + spsolve(normal.tocsc(), (width / (2 * np.pi)) ** 4 * (second.T @ bend[is_smooth]))
 
 
 def find_zingers(transmission: Transmission, threshold: float) -> np.ndarray:

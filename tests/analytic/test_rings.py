@@ -86,6 +86,23 @@ def test_gains_of_a_short_period_are_removed() -> None:
     assert 0.5 < shares[0] < 0.6 and 0.012 < shares[1] < 0.053
 
 
+@pytest.mark.parametrize("are_alike", [True, False])
+def test_offsets_that_change_between_arcs_are_no_gains(are_alike: bool) -> None:
+    """80 views in five arcs, whose columns see the same values in other orders, with offsets that scatter by 0.02 between
+    columns: the same in all arcs, or independent ones in each.
+    """
+    rng, columns = np.random.default_rng(6), 60
+    order = rng.permuted(np.tile(np.arange(16), (columns, 1)), axis=1).T
+    offsets = 0.02 * rng.normal(size=(1 if are_alike else 5, columns))
+    y = (np.tile(order / 8, (5, 1)) + np.repeat(np.broadcast_to(offsets, (5, columns)), 16, axis=0))[:, None]
+    found = remove_rings(y, np.ones(y.shape), "gain", 14)
+    if are_alike:
+        removed = (y - found)[:, 0]
+        assert np.ptp(removed, axis=0).max() < 1e-12 and np.corrcoef(removed[0], offsets[0])[0, 1] > 0.8
+    else:
+        np.testing.assert_array_equal(found, y)
+
+
 def test_offsets_of_a_residual_are_its_mean_without_slow_changes() -> None:
     """For equal weights: the mean over the views without its smooth part; a pixel without weight has no offset."""
     rng = np.random.default_rng(8)
@@ -166,13 +183,13 @@ def errors(seed: int, photons: float, depth: float = 1.0, name: str = "head") ->
 def test_rings_of_two_percent_are_removed(variant_rgb, photons: float) -> None:
     """The mean of three seeds, three deviations of such a mean from the means of the slow test.
 
-    1.131 + 3 x 0.048 / 3^(1/2) = 1.214 after removal, without noise; 1.900 - 3 x 0.098 / 3^(1/2) = 1.73 before, with noise; and
-    1.005 + 3 x 0.002 / 3^(1/2) = 1.0085 where there is nothing to remove.
+    1.131 + 3 x 0.048 / 3^(1/2) = 1.214 after removal, without noise; 1.900 - 3 x 0.098 / 3^(1/2) = 1.73 before, with noise.
+    Where there is nothing to remove, nothing is removed.
     """
     found = [errors(seed, photons) for seed in SEEDS[:3]]
     mean = {name: np.mean([one[name] for one in found]) for name in found[0]}
     assert mean["gain"] < 1.215
-    assert mean["gain, no rings"] < 1.0085
+    assert mean["gain, no rings"] == 1
     assert mean["rings"] > 1.73
     assert mean["sort"] < mean["rings"]
 
@@ -184,7 +201,7 @@ def test_gains_as_unknowns_of_the_fit(variant_rgb) -> None:
     found = [measure_ring_errors(case, seed) for seed in (100, 101)]
     mean = {name: np.mean([one[name] for one in found]) for name in found[0]}
     assert mean["fit"] < 1.25 < 2 < mean["gain"]
-    assert mean["fit, no rings"] < 1.05
+    assert mean["fit, no rings"] == 1
 
 
 @pytest.mark.slow
@@ -193,6 +210,7 @@ def test_rings_of_many_scans(variant_rgb, capsys: pytest.CaptureFixture, name: s
     """The mean over SEEDS, none of which chose the widths; the table is printed (pytest -s).
 
     Without noise, ellipsoids have errors far below those of rings, and lose more than the head: only noise is judged there.
+    Without rings nothing is removed, but by chance: three standard errors are passed by one scan in 700, and by a little.
     """
     for depth, photons in ((1.0, 0.0), (1.0, 1e4), (4.0, 1e4)):
         found = [errors(seed, photons, depth, name) for seed in SEEDS]
@@ -203,6 +221,8 @@ def test_rings_of_many_scans(variant_rgb, capsys: pytest.CaptureFixture, name: s
                 print(f"{name}, {0.53 * depth:g}, {photons:6g} quanta, {step:15}: {numbers}")
             if step == "gain" and (photons or name == "head"):
                 assert values.mean() < 1.3
+            if step == "gain, no rings":
+                assert values.max() < 1.005
 
 
 @pytest.mark.slow

@@ -205,6 +205,14 @@ def test_air_is_looked_for_unless_the_settings_say(monkeypatch: pytest.MonkeyPat
     assert "has 0.5 to 0.6 of" in projections.correct_air(light, None)[2][0]
 
 
+def test_a_scan_without_rings_stays() -> None:
+    """80 views of noise, whose columns agree in no two arcs: the same array, and a line that says so."""
+    y = np.random.default_rng(3).normal(size=(80, 2, 40))
+    for rings in ("gain", "fit"):
+        found, notes = projections.correct_rings(y, np.ones(y.shape), scan(rings=rings).data)
+        assert found is y and notes == [f'no rings above chance: nothing is removed (data.rings = "{rings}")']
+
+
 def test_rings_stay_unless_the_settings_say(measured: ScanReadings) -> None:
     """Off, the line integrals are the same array and nothing is said; on, what is removed from the middle row is kept."""
     before = projections.read_measured(scan(), Path())

@@ -658,6 +658,13 @@ def test_outputs_of_a_scan(tmp_path: Path) -> None:
     assert read_volume(tmp_path / "volumes/reconstruction.vol").values.ravel().tolist() == list(range(24))
 
 
+def test_gains_are_unknowns_of_a_scan_with_rings() -> None:
+    asked, not_asked = (SimpleNamespace(data=SimpleNamespace(rings=rings)) for rings in ("fit", "gain"))
+    with_rings, without = (SimpleNamespace(removed_rings=rings) for rings in (np.ones((6, 5)), None))
+    assert scan_fit.fits_gains(asked, with_rings)
+    assert not scan_fit.fits_gains(asked, without) and not scan_fit.fits_gains(not_asked, with_rings)
+
+
 def test_removed_rings_are_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The middle row with what was removed from it, and without."""
     drawn = []
