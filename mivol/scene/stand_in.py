@@ -1,7 +1,8 @@
-"""One camera in the place of all cameras of a kind, so that Dr.Jit records one render for all of them.
+"""One camera in the place of all cameras of a kind: Dr.Jit then records one render for all cameras.
 
 Dr.Jit 1.5 finds the arrays of every plugin in memory, and records anew if other plugins share arrays with the inputs. A render
-through another camera of the scene is such a change. So a camera of its own takes the numbers of the camera to render.
+through another camera of the scene changes the shared arrays. The stand-in is a separate camera with the numbers of the camera to
+render.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def _pixel_format(film: mi.Film) -> str:
 
 
 def reset_sampler(sensor: mi.Sensor) -> None:
-    """Seed a sampler that does not have one lane: no task reads its numbers, but recordings have inputs for them."""
+    """Seed a sampler of several lanes: no task reads the numbers of the sampler, but recordings have inputs for the numbers."""
     if sensor.sampler().wavefront_size() != 1:
         sensor.sampler().seed(dr.opaque(mi.UInt32, 0), 1)
 
@@ -126,7 +127,7 @@ class _CameraCopy:
 
 
 class StandIn:
-    """A camera that takes the place of others.
+    """A camera in the place of other cameras.
 
     Args:
         sensor: a camera with a kind (:func:`describe_kind`).
@@ -207,7 +208,7 @@ class StandIn:
         self._shown, self._lens = key, copy.lens
 
     def meet(self, sensor: mi.Sensor, others: Sequence[mi.Sensor], names: list[str]) -> None:
-        """Give the films of cameras an image, if they have none, and their samplers numbers: both would come with a render.
+        """Give an image to films without an image, and numbers to the samplers of the cameras, as a render would do.
 
         Dr.Jit finds the arrays of all cameras in memory, and records anew for one more.
 

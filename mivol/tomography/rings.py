@@ -100,8 +100,8 @@ def _subtract_gains(y: np.ndarray, width: int) -> np.ndarray:
 def _share_of_gains(offsets: np.ndarray) -> np.ndarray | float:
     """Share of each column's offset that gains explain, from its offsets in arcs of the scan (arcs, cols).
 
-    A gain is the same in all arcs; a detail of the object moves to other columns. So the variance of gains is the mean square of
-    the columns' mean offsets, less the variance of the means between arcs. The best linear estimate of a gain is its offset
+    A gain is the same in all arcs; a detail of the object moves to other columns. So the variance of gains is the mean square
+    of the columns' mean offsets, less the variance of the means between arcs. The best linear estimate of a gain is its offset
     times ``gains / (gains + errors)``.
 
     Returns:
