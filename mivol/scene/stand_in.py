@@ -1,8 +1,8 @@
 """One camera in the place of all cameras of a kind: Dr.Jit then records one render for all cameras.
 
 Dr.Jit 1.5 finds the arrays of every plugin in memory, and records anew if other plugins share arrays with the inputs. A render
-through another camera of the scene changes the shared arrays. The stand-in is a separate camera with the numbers of the camera to
-render.
+through another camera of the scene changes the shared arrays. The stand-in is a separate camera with the numbers of the
+camera to render.
 """
 
 from __future__ import annotations
