@@ -30,9 +30,9 @@ def hash_grid(**more: object) -> dict:
     return {"type": "mivol_hash", "majorant": 6.0, "seed": 4, **SIZES, **more}
 
 
-def parts(albedo: float = 0.0, emitter: dict | None = None, **more: object) -> dict:
+def parts(albedo: float = 0.0, emitter: dict | None = None, majorant: float = 6.0, **more: object) -> dict:
     """The unit cube of a hash grid."""
-    box = box_of(medium("mivol_medium", hash_grid(), albedo, **more), np.eye(4))
+    box = box_of(medium("mivol_medium", hash_grid(majorant=majorant), albedo, **more), np.eye(4))
     return {"light": emitter or {"type": "constant"}, "box": box}
 
 
@@ -189,12 +189,18 @@ def test_the_light_of_an_even_glow_is_its_opacity(variant_rgb: str) -> None:
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_gradients_of_images_without_noise(variant_rgb: str) -> None:
-    """By the place of the lamp and by weights: estimates of derivatives against differences of images without noise."""
+    """By the place of the lamp and by weights: estimates of derivatives against differences of images without noise.
+
+    The lamp moves across its distance to the cube, so that its shadows change most.
+    """
     lamp = {"type": "point", "position": LAMP.tolist()}
-    scene, params = view({"max_depth": 2, "deterministic": True}, albedo=0.7, emitter=lamp)
+    scene, params = view({"max_depth": 2, "deterministic": True}, albedo=0.7, emitter=lamp, majorant=40.0)
     keys, runs = ("light.position", KEY + "weights_1"), 12
     values = {key: np.array(params[key], np.float64) for key in keys}
     along = {key: np.ones_like(value) / np.sqrt(value.size) for key, value in values.items()}
+    away = LAMP - 0.5
+    upwards = np.cross(np.cross(away, [0, 0, 1]), away)
+    along["light.position"] = (upwards / np.linalg.norm(upwards)).reshape(along["light.position"].shape)
 
     def put(key: str, value: np.ndarray) -> None:
         value = np.float32(value)
@@ -221,8 +227,9 @@ def test_gradients_of_images_without_noise(variant_rgb: str) -> None:
     for key in keys:
         found, truth = np.array(drawn[key]), slopes[key].mean()
         moments = Moments(runs, found.mean(), ((found - found.mean()) ** 2).sum())
-        # The slope of a shadow has the relative error of the quadrature of a slope, of first order at kinks: a half cell.
-        assert_same_mean(moments, truth, rounding=np.ptp(slopes[key]) + 0.02 * abs(truth), what=key)
+        # The slope of a shadow errs by the quadrature of a slope that jumps: by 0.9 % of its smallest component, where
+        # cells lay beside the kinks (docs/notes/radiance_fields.md); halves between them err by a third of that or less.
+        assert_same_mean(moments, truth, rounding=np.ptp(slopes[key]) + 0.005 * abs(truth), what=key)
 
 
 def test_a_jump_is_integrated_to_a_part_of_a_cell(variant_rgb: str) -> None:
