@@ -3,7 +3,7 @@
 ``mivol.<tab>`` lists the functions for scripts: scenes (``load_scene``, ``explain``, ``render_reference``), fits (``Problem``,
 ``Parameter``, ``optimize`` and optimizers), volumes (``read_volume``, ``write_volume``, ``make_procedural``), photographs
 (``load_photos``, ``fit_photographs``, ``fit_gaussians``, ``read_field``), Gaussians and points (``read_gaussians``,
-``read_points``, ``Splatter``) and tomography (``Projector`` and its geometries). Each name is imported at its first use.
+``read_points``, ``Splatter``) and tomography (``Projector`` and its geometries). Each name is imported at the first use.
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ FittedProblem = RadianceProblem | OctreeProblem | SampledProblem | GaussianProbl
 
 @dataclass(frozen=True)
 class PhotoProblem:
-    """A fit before its first step.
+    """A fit before the first step.
 
     Attributes:
         problem: the fitted model.
@@ -235,7 +235,7 @@ def fit_photographs(problem: FittedProblem, walk_side: int) -> PhotoFit:
     """Take all steps of a fit, and measure them.
 
     Args:
-        problem: fit before its first step.
+        problem: fit before the first step.
         walk_side: the reference walk has ``walk_side`` squared rays.
     """
     watch, rates = Stopwatch(), [measure_walk_rate(walk_side)]

@@ -72,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _is_output_closed() -> bool:
     """Whether the reader of the output has gone, as in ``mivol explain scene.xml | head``; then the output goes nowhere.
 
-    A text longer than Python's buffer is lost at its first write, so a further flush tells nothing, and the system is asked.
+    A text longer than Python's buffer is lost at the first write, so a further flush tells nothing, and the system is asked.
     """
     try:
         sys.stdout.flush()

@@ -116,7 +116,7 @@ def from_dict(raw: dict[str, Any], name: str = "cluster") -> ClusterSettings:
         name: beginning of an error message.
 
     Raises:
-        MivolError: an unknown key, a wrong type, or a value outside its domain.
+        MivolError: an unknown key, a wrong type, or a value outside the domain.
     """
     check_keys({key: value for key, value in raw.items() if key != "job"}, ClusterSettings, "", name)
     try:

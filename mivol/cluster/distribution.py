@@ -1,6 +1,6 @@
 """Fits on a cluster: which parts of each kind of fit the workers compute, and steps over images of a scene in blocks of views.
 
-Conventions. Steps of scenes and of photographs are sums over views; a scan has products with A and its transpose, sums over
+Conventions. Steps of scenes and of photographs are sums over views; a scan has products with A and the transpose, sums over
 blocks of views. The rest of a run stays in the owner's process: it has the whole problem, and takes the steps. A worker
 has the inputs and a copy of the problem (:mod:`mivol.cluster.steps`). Losses are added in the order of the blocks.
 
@@ -120,7 +120,7 @@ class SharedSceneProblem(SceneProblem):
     steps: Steps
 
     def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[float, Reals]:
-        """f(u) and its gradient, as :meth:`SceneProblem.loss_and_gradient`."""
+        """f(u) and the gradient, as :meth:`SceneProblem.loss_and_gradient`."""
         chosen = draw_views(iteration, len(self.views), views, self.seed) if views else None
         found = self.ask(GRADIENT, reals, iteration, chosen)
         loss = self.take_losses(found)
@@ -178,7 +178,7 @@ class SharedLinearization(Linearization):
     problem: SharedSceneProblem
 
     def differentiate_images(self) -> tuple[float, Reals]:
-        """Loss of the images, and its derivative by the values."""
+        """Loss of the images, and the derivative by the values."""
         found = self.problem.ask(LINEARIZATION, self.reals, 0)
         return self.problem.take_losses(found), to_tensors(found)
 

@@ -113,7 +113,7 @@ def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment:
         changes: ``a.b=c`` from the command line; entries of a list by index, ``parameter.0.lr=0.1``.
 
     Raises:
-        MivolError: a missing file, invalid TOML, an unknown key, a wrong type, or a value outside its domain.
+        MivolError: a missing file, invalid TOML, an unknown key, a wrong type, or a value outside the domain.
     """
     path = Path(path)
     try:

@@ -69,7 +69,7 @@ MOST_LEVELS = 12
 
 
 class FieldSettings(Section):
-    """The radiance field and its fit."""
+    """The radiance field and the fit."""
 
     kind: Annotated[Literal["grid"], setting("1", "a sparse grid of density and harmonics")] = "grid"
     preset: Annotated[str, setting("1", "nodes, steps, rates, priors: tiny, cpu, fine, capture or gpu", min_length=1)] = "cpu"
@@ -165,7 +165,7 @@ class FieldExperiment(Section):
 
 
 class HashSettings(Section):
-    """The hash grid and its fit."""
+    """The hash grid and the fit."""
 
     kind: Annotated[Literal["hash"], setting("1", "a multi-resolution hash grid with two small networks")]
     preset: Annotated[str, setting("1", "sizes, steps, rates: tiny, minute, minutes or gpu", min_length=1)] = "minute"
@@ -202,7 +202,7 @@ class HashExperiment(Section):
 
 
 class NerfSettings(Section):
-    """The coordinate network and its fit."""
+    """The coordinate network and the fit."""
 
     kind: Annotated[Literal["nerf"], setting("1", "one coordinate network, density and colour of a place and a direction")]
     preset: Annotated[str, setting("1", "sizes, steps, rates: tiny, minutes or gpu", min_length=1)] = "minutes"
@@ -247,7 +247,7 @@ class NerfExperiment(Section):
 
 
 class OctreeSettings(Section):
-    """The octree and its fit: a grid first, or a field of a file."""
+    """The octree and the fit: a grid first, or a field of a file."""
 
     kind: Annotated[Literal["octree"], setting("1", "a grid, its octree, and a fit of the leaves")]
     start: Annotated[

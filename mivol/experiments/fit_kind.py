@@ -225,7 +225,7 @@ class FitKind(ABC):
 
     @abstractmethod
     def rehearse(self, say: Say) -> Explanation:
-        """Begin the fit up to its first step, and write nothing; return the remaining facts.
+        """Begin the fit up to the first step, and write nothing; return the remaining facts.
 
         Raises:
             MivolError: settings or data refused by the first step.

@@ -159,7 +159,7 @@ class GaussianStart:
     lines: list[PlanLine]
 
     def problem(self, seed: int) -> GaussianProblem:
-        """Return the problem before its first step; ``seed`` draws the views and the places."""
+        """Return the problem before the first step; ``seed`` draws the views and the places."""
         return GaussianProblem(self.batches, [view.camera for view in self.views], self.cloud, self.plan, seed)
 
 

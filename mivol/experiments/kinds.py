@@ -1,6 +1,6 @@
 """Kinds of experiments: run an experiment, or explain an experiment.
 
-Conventions. ``explain`` begins a fit up to its first step. After that, only the disk and the run folder can refuse the fit.
+Conventions. ``explain`` begins a fit up to the first step. After that, only the disk and the run folder can refuse the fit.
 """
 
 from __future__ import annotations

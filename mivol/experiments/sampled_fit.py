@@ -75,7 +75,7 @@ def make_sampled_batches(photos: Photos) -> RayBatches:
 
 
 def make_sampled_problem(plan: SampledPlan, photos: Photos, seed: int) -> SampledProblem:
-    """The fit of photographs with a box, before its first step."""
+    """The fit of photographs with a box, before the first step."""
     return SampledProblem(make_sampled_batches(photos), photos.box, plan, seed)
 
 

@@ -11,7 +11,7 @@ sigma-bar is the density of the radiance field, averaged over the voxels of the 
 start. C are the powers of 2 in :data:`FACTORS`, and S^n the first :data:`TRIAL` steps of the fit.
 
 A dense scattering medium has local minima: matter in the shadow of other matter is as dark as empty space. A radiance field
-is emissive, and its fit carves the shape from the silhouettes and puts the shading into the colours. Its density is no
+is emissive, and the fit carves the shape from the silhouettes and puts the shading into the colours. Its density is no
 extinction of the scattering model (a surface is as opaque as the views allow), hence the factor. The loss of a start does not
 predict the best factor; each factor therefore gets a few steps.
 
@@ -105,7 +105,7 @@ def make_start(settings: Sought, base: Path, scene: mi.Scene) -> Start:
     """Return a parameter with its first value; the scene is not changed.
 
     Raises:
-        MivolError: an unknown parameter, a value outside its domain, an unreadable file, or a grid beyond the memory.
+        MivolError: an unknown parameter, a value outside the domain, an unreadable file, or a grid beyond the memory.
     """
     params = traverse(scene)
     start_value = as_tensor(params[find(settings.key, params)])

@@ -1,4 +1,4 @@
-"""Where the values of a sparse grid are stored: in bricks of 8^3 nodes with a table of the bricks of its box, or node by node.
+"""Where the values of a sparse grid are stored: in bricks of 8^3 nodes with a table of the bricks of the box, or node by node.
 
 Conventions. Those of :mod:`mivol.files.volume`. The *slot* of a node is its row among the stored values: the first slot
 of its brick plus its place in the brick (z, y, x). A node of a brick that is not stored has the value 0 and no derivative.

@@ -10,7 +10,7 @@ about 0.05 m.
 a step of a fit evaluates the network once a node, not at every point of every path.
 
 Conventions. The parameters are tensors: ``table`` (rows, features), and ``weights_k`` (outputs, inputs) of layer k. The field
-is grey, and 0 outside its box.
+is grey, and 0 outside the box.
 
 References: Müller et al. 2022 (encoding). Their activation, an exponential, has no bound.
 """

@@ -438,7 +438,7 @@ class NerfField(SampledField):
         return seen, hidden, _apply(layers["rgb_linear"], hidden)
 
     def _density_and_slope(self, raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Extinction of the outputs of the trunk, and its derivative."""
+        """Extinction of the outputs of the trunk, and the derivative."""
         unit = np.float32(self.frame[3])
         if self.sizes.relu:
             return np.maximum(raw, 0) / unit, (raw > 0) / unit

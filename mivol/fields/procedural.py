@@ -112,7 +112,7 @@ class Cumulus:
 
 
 def make_cumulus(voxels: int, extinction: float = 150.0, cumulus: Cumulus | None = None) -> SparseVolumeData:
-    """Make a cloud in bricks, in about 3 % of its box.
+    """Make a cloud in bricks, in about 3 % of the box.
 
     Args:
         voxels: voxels along each edge of the box.

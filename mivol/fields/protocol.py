@@ -7,7 +7,7 @@ ray reaches it, cell by cell or in closed form. ``BOUNDED``: transport knows onl
 transmittance with the majorant, and derivatives at random points. Where noise is not asked for (``deterministic``, AOVs, a
 moving emitter), it integrates f by Gauss points in the cells of ``resolution``.
 
-Conventions. A field is 0 outside its box, the unit cube under ``to_world``. A plugin (:mod:`mivol.plugins`) hands the field to
+Conventions. A field is 0 outside the box, the unit cube under ``to_world``. A plugin (:mod:`mivol.plugins`) hands the field to
 transport as ``mivol_extinction``, and its parameters to ``mi.traverse``.
 """
 

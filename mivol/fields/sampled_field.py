@@ -6,7 +6,7 @@ Line integrals sample the field (:mod:`mivol.transport.line_integrals.sampled_ra
 sampled field: the adjoint evaluates the products with derivatives at the same points.
 
 Conventions. Points and directions are in the world; directions point along the travel, |d| = 1. The extinction is in 1/length,
-colours are sRGB code values or radiance (``space``). A field is 0 outside its box, the unit cube under ``to_world``, and is
+colours are sRGB code values or radiance (``space``). A field is 0 outside the box, the unit cube under ``to_world``, and is
 evaluated only inside.
 """
 

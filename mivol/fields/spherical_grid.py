@@ -10,7 +10,7 @@ are directions of camera rays, not of light. They are taken in the grid's own fr
 with the signs of ``dr.sh_eval``, as in PlenOctrees, Plenoxels and 3D Gaussian splatting.
 
 Levels. The boxes of a nested field share the middle m and the number of nodes, and each has twice the extent of the one before.
-A level holds the matter of its box outside the box of the level before. Level l is level 0 seen from 2^l times as far,
+A level holds the matter of the box outside the box of the level before. Level l is level 0 seen from 2^l times as far,
 
 .. math:: \sigma(x) = 2^{-l} a\big(\rho(y)\big), \qquad y = m + 2^{-l} (x - m),
 
@@ -93,7 +93,7 @@ class SphericalGrid:
         clamp: whether colours below 0 count as 0.
         levels: number of nested boxes, each of twice the extent; ``res`` and ``to_world`` belong to the innermost box.
         space: meaning of colours: "srgb" (code values, as in photographs) or "linear" (radiance).
-        index: rows of the nodes, made by :meth:`sparse_index` at its first call.
+        index: rows of the nodes, made by :meth:`sparse_index` at the first call.
     """
 
     res: tuple[int, int, int]

@@ -43,7 +43,7 @@ def upsample(field: mi.TensorXf, shape: tuple[int, int, int]) -> mi.TensorXf:
 
     The field is interpolated linearly between voxel centres with clamped borders (weights >= 0: no overshoot), then multiplied
     by one factor per channel. The mass of a trilinear field with clamped borders is exactly the mean of its voxels times the
-    volume of its box: each voxel's hat, with its border half, integrates to one cell.
+    volume of the box: each voxel's hat, with its border half, integrates to one cell.
 
     Args:
         field: (Z, Y, X, C), finite.

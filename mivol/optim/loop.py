@@ -293,7 +293,7 @@ def begin_fit(
     measure: Measure | None = None,
     checkpoint: CheckpointFile | None = None,
 ) -> Fit:
-    """A fit before its first step, or at its checkpoint; arguments as :func:`reconstruct`.
+    """A fit before the first step, or at its checkpoint; arguments as :func:`reconstruct`.
 
     Raises:
         MivolError: the optimizer starts no :class:`mivol.optim.optimizer.OptimizerRun`.

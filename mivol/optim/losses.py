@@ -249,7 +249,7 @@ class ImageShape:
 
 
 def image_loss(x: mi.Float, y: mi.Float, shape: ImageShape, weight: float) -> tuple[mi.Float, mi.Float]:
-    """f, an array of width 1, and its derivative by each number of x; both can be recorded (``dr.freeze``).
+    """f, an array of width 1, and the derivative by each number of x; both can be recorded (``dr.freeze``).
 
     Args:
         x: the image, evaluated.
@@ -270,7 +270,7 @@ def image_loss(x: mi.Float, y: mi.Float, shape: ImageShape, weight: float) -> tu
 
 
 def mean_ssim(x: mi.Float, y: mi.Float, shape: ImageShape) -> tuple[mi.Float, mi.Float]:
-    """Mean SSIM over pixels and channels, an array of width 1, and its derivative by each number of x; arguments evaluated."""
+    """Mean SSIM over pixels and channels, an array of width 1, and the derivative by each number of x; arguments evaluated."""
     columns, rows = _Axis.along_columns(x, shape), _Axis.along_rows(x, shape)
     sums = columns.blur((x, y), lambda a, b: (a, b, a * a, b * b, a * b))
     mx, my, xx, yy, xy = rows.blur(sums, _identity, evaluate=False)

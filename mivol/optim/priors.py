@@ -95,7 +95,7 @@ class Prior(Strategy, tag="prior"):
             spacing: voxel size (z, y, x) [length].
 
         Returns:
-            The energy and its gradient, in the shape of ``x``.
+            The energy and the gradient, in the shape of ``x``.
 
         Raises:
             MivolError: ``x`` has another rank.

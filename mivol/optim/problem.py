@@ -66,7 +66,7 @@ class DifferentiableProblem(Problem, Protocol):
     """Additional methods for first-order optimizers."""
 
     def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[SupportsFloat | mi.Float, Reals]:
-        """f(u) and its gradient. A loss of type ``mi.Float`` has width 1. The device may still compute a loss that is no
+        """f(u) and the gradient. A loss of type ``mi.Float`` has width 1. The device may still compute a loss that is no
         ``float``.
 
         Args:

@@ -76,7 +76,7 @@ def check_strategy(given: S) -> S:
     """Return a strategy that was made in Python, where msgspec checks no values.
 
     Raises:
-        MivolError: a class in place of an object, or a value outside its domain.
+        MivolError: a class in place of an object, or a value outside the domain.
     """
     if isinstance(given, type):
         raise MivolError(f"found the class {given.__name__}, expected an object: write {given.__name__}(...).")

@@ -343,7 +343,7 @@ class TabulatedVolume(VoxelVolume):
 
     Args:
         density: the field.
-        nodes: nodes along the longest edge of its box.
+        nodes: nodes along the longest edge of the box.
     """
 
     def __init__(self, props: mi.Properties, density: HashDensity | FittedDensity, nodes: int) -> None:

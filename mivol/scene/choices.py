@@ -79,7 +79,7 @@ MIN_BRANCHING_SAMPLES, MAX_IMAGE_BRANCHES, MAX_BRANCHING_TIME, MIN_BRANCHING_GAI
 without branches, and the smallest predicted gain in variance x time."""
 
 BRANCH_COST, EVENT_COST = 0.5, 0.5
-"""Time of a branch without scattering events, and of an event, over the time of a camera ray up to its first collision.
+"""Time of a branch without scattering events, and of an event, over the time of a camera ray up to the first collision.
 Measured for an event, with this time of a branch: jade 0.4, tissue 0.2, wax behind rough glass 0.9, smokes and a cloud 0.5 to
 0.8, smoke on a floor 0.5."""
 
@@ -372,7 +372,7 @@ def is_branch_noise_open(needs: Needs, settings: Settings, segment: str) -> bool
 
 
 def choose_image_branches(needs: Needs, settings: Settings, segment: str) -> tuple[int, list[Choice]]:
-    """Choose the number of branches of a path at its first collision, in images; 1 for none.
+    """Choose the number of branches of a path at the first collision, in images; 1 for none.
 
     With k branches at r times the time of a stem each, variance x time is (A + B / k)(1 + r k).
     """

@@ -102,7 +102,7 @@ def depth_two_error(albedo: float, tau: float, light: str = "constant", phase: s
             by 0 to 0.15 (0.51 for 0.61 at albedo 0.9 and tau = 10), a cube below a point light by at most 0.016.
 
     Raises:
-        MivolError: an albedo or an optical depth outside its domain, or a name missing from the table.
+        MivolError: an albedo or an optical depth outside the domain, or a name missing from the table.
     """
     if (light, phase) not in TABLES:
         known = " and ".join(sorted({f'"{name}"' for key in TABLES for name in key}))

@@ -51,7 +51,7 @@ def format_override(value: Any) -> str:
 def describe_error(error: Exception) -> str:
     """Format an error of Mitsuba as one line, without the source position, shortened for long files.
 
-    For an error in a Python plugin Mitsuba quotes the whole traceback; only the message at its end is kept. Python 3.11.2
+    For an error in a Python plugin Mitsuba quotes the whole traceback; only the message at the end is kept. Python 3.11.2
     loses a message that is not UTF-8 (later versions raise UnicodeDecodeError).
     """
     text = TRACEBACK.sub("", re.sub(r"^\s*\[[\w.]+:\d+\]\s*", "", str(error)))

@@ -258,7 +258,7 @@ def _phase_name(phase: mi.PhaseFunction | None) -> str:
 
 
 def _bound_optical_depth(boundary: Boundary, view: MediumView, reads: list[GridReading], survey: SceneSurvey) -> float | None:
-    """Bound the optical depth of a medium by its largest extinction times the diameter of its box or ball."""
+    """Bound the optical depth of a medium by its largest extinction times the diameter of the box or ball."""
     bounds = [float(p.majorant[0]) for p in view.parts if not p.exact_line]
     bounds += [max(p.field.bound()) for p in view.parts if isinstance(p, GaussianExtinction | OctreeExtinction)]
     constants = [float(np.max(np.array(dr.detach(p.constant)))) for p in view.parts if p.is_constant]

@@ -115,7 +115,7 @@ class Plan:
         draws_emission: whether scattering points sample the light emitted by media.
         successive_paths: most paths per lane, walked one after the other.
         branches: whether paths branch at their first collision for derivatives.
-        image_branches: branches of a path at its first collision, in images; 1 for none.
+        image_branches: branches of a path at the first collision, in images; 1 for none.
         draws_near_light: whether segments of paths draw the light of emitters with a position, in images.
         near_light_in_derivatives: the same, in derivatives.
         near_emitters: numbers of the emitters inside of media.

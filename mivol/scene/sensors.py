@@ -319,7 +319,7 @@ def parse_rig(table: Mapping[str, Any]) -> Rig:
         table: ``rig`` (a key of ``RIGS``) and its settings.
 
     Raises:
-        MivolError: an unknown rig or setting (with the nearest name), or a value outside its domain.
+        MivolError: an unknown rig or setting (with the nearest name), or a value outside the domain.
     """
     name = table.get("rig", "ring")
     if name not in RIGS:

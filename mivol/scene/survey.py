@@ -41,7 +41,7 @@ class BranchNoise:
     """What a preview measures of paths up to and behind their first collision.
 
     Attributes:
-        stem, branch: variance in a pixel of the light of a stem (up to and at its first collision), and of a branch behind it.
+        stem, branch: variance in a pixel of the light of a stem (up to and at the first collision), and of a branch behind it.
         share: share of camera rays with a collision [1].
         events: mean number of scattering events of a branch.
     """
@@ -353,7 +353,7 @@ def find_outside_media(media: Iterable[mi.Medium], boundaries: Sequence[Boundary
 def _split_levels(boundary: Boundary) -> list[Boundary]:
     """Split the boundary of a nested radiance field into levels; other boundaries stay whole.
 
-    A level fills the part of its box inside the boundary, without the box of the level before.
+    A level fills the part of the box inside the boundary, without the box of the level before.
 
     Raises:
         MivolError: a nested field in a shape other than a box.

@@ -10,7 +10,7 @@ C is never singular, however thin the Gaussian.
 
 Conventions. Arrays of the cloud are flat, Gaussian after Gaussian; splats have an array for each component. Colours are
 max(0, 1/2 + sum Y_b k_b), with the basis of ``dr.sh_eval`` and the direction from the camera to the mean. If the sum is below
--1/2, the channel is black and its derivative by harmonics and direction is 0, as the derivative of the function is: a channel
+-1/2, the channel is black and the derivative by harmonics and direction is 0, as the derivative of the function is: a channel
 black in all photographs stays black in a fit. Opacity, place and shape keep their derivatives. The numbers of a camera are on
 the device, so kernels do not depend on its pose.
 

@@ -379,7 +379,7 @@ def interpolate_gaps(y: np.ndarray, weights: np.ndarray) -> np.ndarray:
 class LightDrift:
     """Drift of the light's pattern away from the flats: line integrals ``offset + slope time`` of each pixel.
 
-    Flats taken before a scan are outdated at its end: the beam's stripes have moved, and each pixel is too dark or too bright
+    Flats taken before a scan are outdated at the end: the beam's stripes have moved, and each pixel is too dark or too bright
     by a factor that changes slowly between views (stripes in the sinogram, rings in the slice).
     """
 

@@ -363,7 +363,7 @@ class Transpose:
 
 
 class _Projection(dr.CustomOp):
-    """y = A x, with its tangent and its transpose, in passes."""
+    """y = A x, with its tangent and the transpose, in passes."""
 
     def eval(self, values: mi.Float, projector: Projector) -> mi.Float:
         self.projector = projector

@@ -37,7 +37,7 @@ SMALL_PRODUCT = 1 << 26
 """Most multiplications of a product that SciPy computes on one core: smaller ones read caches, and start no kernel."""
 
 MIN_PRODUCTS = 9
-"""Products with A and its transpose per layer after which storing pays: storing an entry takes about 23 ns, and each pair of
+"""Products with A and the transpose per layer after which storing pays: storing an entry takes about 23 ns, and each pair of
 products reads the entry 2.6 ns sooner than a walk computes it (2.2 and 4.8 ns, a single layer)."""
 
 Blocks = list[scipy.sparse.csr_array]

@@ -140,7 +140,7 @@ def prepare_reference(
     overrides: Mapping[str, object] | None = None,
     accept_doubts: bool = False,
 ) -> PreparedReference:
-    """Check a reference, and read what is on disk, up to its first batch.
+    """Check a reference, and read what is on disk, up to the first batch.
 
     Args:
         scene, out, max_depth, target_se, relative, max_spp, integrator, rr_depth, hide_emitters, sensor, seed, pass_spp,
@@ -335,7 +335,7 @@ class _BatchRun:
 
 @dataclass
 class PreparedReference:
-    """A reference before its first batch, between two batches, or as found on disk.
+    """A reference before the first batch, between two batches, or as found on disk.
 
     Attributes:
         setup: inputs of its batches.

@@ -262,7 +262,7 @@ class MediumShape:
 
     Attributes:
         name: name of the shape.
-        points: (N, 3) world points whose hull holds the shape: mesh vertices, or the corners of its box.
+        points: (N, 3) world points whose hull holds the shape: mesh vertices, or the corners of the box.
         faces: (M, 3) indices of a mesh; None without a mesh.
         to_world: (4, 4) of a shape without mesh; None for a mesh.
         to_local: (4, 4) world to the unit cube of the volume under a stock ``heterogeneous``; None under other media.

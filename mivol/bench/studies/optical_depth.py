@@ -420,7 +420,7 @@ def volpath(rays: GridRays, spp: int) -> Contestant:
 
 
 def pad_for_drjit(values: np.ndarray) -> mi.TensorXf:
-    """Pad a grid by one voxel on each side for ``drjit.dda.integrate``, whose nodes lie at the corners of its box."""
+    """Pad a grid by one voxel on each side for ``drjit.dda.integrate``, whose nodes lie at the corners of the box."""
     return mi.TensorXf(np.pad(values, 1, mode="edge"))
 
 

@@ -217,7 +217,7 @@ MEMORY_TASKS = ("medium", "gradient", *OPTIMIZERS)
 
 
 def measure_memory(size: SparseSize) -> dict:
-    """How much memory do the cloud, its density gradient and its fit need, and how long does its first picture take?"""
+    """How much memory do the cloud, its density gradient and the fit need, and how long does its first picture take?"""
     with tempfile.TemporaryDirectory() as folder:
         paths = {"cloud": Path(folder) / "cloud.vdb", "one brick": Path(folder) / "one.vdb"}
         cloud = make_cumulus(size.cloud_res)
@@ -354,7 +354,7 @@ def measure_fit(size: SparseSize) -> dict:
 
 
 def smoke_puff(res: int, thick: float = 1.0) -> np.ndarray:
-    """A smoke (Z, Y, X, 1) along a curl, in 5 % of its box; ``thick`` is a factor on its radius."""
+    """A smoke (Z, Y, X, 1) along a curl, in 5 % of the box; ``thick`` is a factor on its radius."""
     z, y, x = np.meshgrid(*[(np.arange(res, dtype=np.float32) + 0.5) / res] * 3, indexing="ij", sparse=True)
     away = np.hypot(x - 0.5 - 0.15 * np.cos(7 * z), y - 0.5 - 0.15 * np.sin(7 * z))
     inside = thick * (0.09 + 0.07 * z) - away + 0.012 * np.sin(40 * x) * np.sin(40 * y) * np.sin(40 * z)

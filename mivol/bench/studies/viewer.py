@@ -123,7 +123,7 @@ def run_fit(folder: Path, size: ViewerSize) -> dict[str, float]:
 
 
 def look_at_run(run: Path, edge: int) -> None:
-    """Be the viewer of a run from its start to its end: one new camera after another; prints the number of pictures."""
+    """Be the viewer of a run from its start to the end: one new camera after another; prints the number of pictures."""
     while not (run / RECORD).exists() or read_record(run).status != "running":
         time.sleep(0.05)
     choose_back_end("llvm_ad_rgb", 0)

@@ -160,7 +160,7 @@ class GaussianProblem(StagedProblem, DividedProblem):
     # -- Loss and gradient --------------------------------------------------------------------------------------------
 
     def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[mi.Float, Reals]:
-        """Mean loss of the views of a step and its gradient; the views follow a new random order per epoch.
+        """Mean loss of the views of a step and the gradient; the views follow a new random order per epoch.
 
         Args:
             reals: of the cloud.

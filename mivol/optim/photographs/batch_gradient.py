@@ -81,7 +81,7 @@ def differentiate_tiles(
     background: mi.Color3f | None,
     depth_rays: DepthRays | None,
 ) -> Reals:
-    """The loss of the tiles of a step and its derivatives by the reals, as shares of the step's mean.
+    """The loss of the tiles of a step and the derivatives by the reals, as shares of the step's mean.
 
     Args:
         model: with the values of ``reals``.

@@ -192,7 +192,7 @@ class RadiancePlan:
         return Course(self.steps, events=(*own, *align, *more))
 
     def with_longest(self, longest: int) -> RadiancePlan:
-        """The plan with another number of nodes along the longest edge at its end; coarser stages stay.
+        """The plan with another number of nodes along the longest edge at the end; coarser stages stay.
 
         If all stages are coarser, the last one takes half its steps: it only has to find empty regions and initial colours.
         """
@@ -298,7 +298,7 @@ NESTED_FILLED = 0.4
 """Assumed share of stored nodes in a finer stage of nested boxes, which hold the surroundings (0.37 for a room)."""
 
 SHELL = 50
-"""Assumed number of stored nodes in a finer stage, per node of a slice of its box. Visible matter is a shell, so its share of a
+"""Assumed number of stored nodes in a finer stage, per node of a slice of the box. Visible matter is a shell, so its share of a
 grid falls with the edge (the chair in the box of its silhouettes: 30, 38 and 52 at 64, 128 and 256 nodes, the last value after
 short stages)."""
 

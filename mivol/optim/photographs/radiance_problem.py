@@ -174,7 +174,7 @@ class RadianceProblem(SparseProblem, DividedProblem):
     # -- Loss and gradient --------------------------------------------------------------------------------------------
 
     def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[mi.Float, Reals]:
-        """Mean (weighted) squared error of an iteration's rays, and its gradient; 0 views takes the stage's number.
+        """Mean (weighted) squared error of an iteration's rays, and the gradient; 0 views takes the stage's number.
 
         Noise: from the choice of pixels. Bias: as :func:`mivol.transport.line_integrals.radiance_source.bake`.
         """
@@ -491,7 +491,7 @@ def _nodes_of(field: SphericalGrid, cells: OccupiedCells, chosen: mi.Bool) -> np
 
 
 def begin_radiance_fit(batches: RayBatches, box: np.ndarray, plan: RadiancePlan, seed: int = 0) -> Fit:
-    """A fit before its first step, for callers that take the steps themselves.
+    """A fit before the first step, for callers that take the steps themselves.
 
     Args:
         batches: the photographs.

@@ -205,7 +205,7 @@ class SampledProblem(DividedProblem):
     # -- Loss and gradient --------------------------------------------------------------------------------------------
 
     def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[mi.Float, Reals]:
-        """Mean (weighted) squared error of an iteration's rays, and its gradient; 0 views takes the plan's number.
+        """Mean (weighted) squared error of an iteration's rays, and the gradient; 0 views takes the plan's number.
 
         Noise: from the choice of pixels and of samples.
         """

@@ -50,7 +50,7 @@ class DiskSweeps:
     Attributes:
         beam, grid: geometry, and all voxels.
         slabs: layers of each slab.
-        rows_of: function from a grid to the rows that the inside of its box shadows.
+        rows_of: function from a grid to the rows that the inside of the box shadows.
         views_at_once: views of a product.
         folder: folder of the files.
         n_subsets, relaxation, decay, nonnegative: as of :func:`ordered_subsets_sart`.

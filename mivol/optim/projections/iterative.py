@@ -78,7 +78,7 @@ def check_sweeps(problem: LeastSquares, n_subsets: int = 1, relaxation: float = 
     """Check the arguments of :func:`ordered_subsets_sart`.
 
     Raises:
-        MivolError: a prior, relaxation or decay outside its domain, or an invalid number of subsets.
+        MivolError: a prior, relaxation or decay outside the domain, or an invalid number of subsets.
     """
     if problem.prior is not None:
         raise MivolError(

@@ -249,7 +249,7 @@ class SceneProblem(LinearizableProblem):
     # -- Loss and gradient ----------------------------------------------------------------------------------------
 
     def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[SupportsFloat, Reals]:
-        """f(u) and its gradient over ``views`` views, drawn anew in each iteration; 0 takes all views.
+        """f(u) and the gradient over ``views`` views, drawn anew in each iteration; 0 takes all views.
 
         Image and derivative have independent seeds: an estimate of d(I^2) = 2 I dI from the same samples is biased.
         Noise: from the integrator; absorbing media have only the noise of the pixel filter. Effect on the loss:
@@ -385,7 +385,7 @@ class Linearization:
         self.loss += math.fsum(float(energy[0]) for energy in energies)
 
     def differentiate_images(self) -> tuple[float, Reals]:
-        """Loss of the images, and its derivative by the values."""
+        """Loss of the images, and the derivative by the values."""
         problem, compared = self.problem, []
         problem.set_reals(self.reals)
         for index, (batch, seed) in enumerate(zip(problem.batches, self.seeds, strict=True)):

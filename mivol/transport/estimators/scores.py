@@ -182,7 +182,7 @@ class Replay:
 
     Attributes:
         L: radiance from further along the path. A path with a single segment does not need it (None): the only light behind its
-            factor is the emission at its end, so the factor waits for this term.
+            factor is the emission at the end, so the factor waits for this term.
         dL: d loss / d L.
         pending: the waiting factor.
     """

@@ -173,7 +173,7 @@ class SegmentEstimator(Protocol):
         """Draw the random numbers of a segment, for ``PathSegment.samples``."""
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
-        """Follow a segment to its end, for the purpose IMAGE, REVERSE or FORWARD."""
+        """Follow a segment to the end, for the purpose IMAGE, REVERSE or FORWARD."""
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """Prepare for derivatives along camera rays; called before each pass, with an effect in the first call only."""
@@ -292,7 +292,7 @@ class TrackedAbsorption:
     Args:
         media: media of the scene.
 
-    Bias: none, for the radiance and its derivatives. Variance: ratio tracking, and one point for derivatives. Cost: one walk of
+    Bias: none, for the radiance and the derivatives. Variance: ratio tracking, and one point for derivatives. Cost: one walk of
     each exact medium; look-ups in proportion to the majorants of the others.
     """
 

@@ -227,7 +227,7 @@ def integrate_distance_in_cell(a: mi.Float, dt: mi.Float, near: mi.Float, middle
 def _integrate_in_constant(piece: RayPiece, origin: mi.Float, sigma: mi.Float) -> CellIntegral:
     """Integrate over constant extinction of any length.
 
-    For an infinite length N = a + 1/sigma. For extinction 0 the expected depth is undefined; N and its derivative are then 0.
+    For an infinite length N = a + 1/sigma. For extinction 0 the expected depth is undefined; N and the derivative are then 0.
     """
     begin = dr.select(piece.on, piece.a - origin, 0)
     finite = dr.isfinite(piece.dt)

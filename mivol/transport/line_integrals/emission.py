@@ -361,7 +361,7 @@ def _extend_to_infinity(
 
 
 def _eval_albedo(piece: RayPiece, t: mi.Float) -> mi.Spectrum:
-    """The albedo at a point of a ray, attached. A stock grid repeats its border outside its box."""
+    """The albedo at a point of a ray, attached. A stock grid repeats its border outside the box."""
     albedo = piece.body.view.albedo
     return albedo.eval(medium_interaction(piece.ray, t), piece.on) if isinstance(albedo, mi.Volume) else mi.Spectrum(albedo)
 
@@ -407,7 +407,7 @@ class Emission:
         return self
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
-        """Follow a segment to its end and sum its emission, for the purpose IMAGE, REVERSE or FORWARD."""
+        """Follow a segment to the end and sum its emission, for the purpose IMAGE, REVERSE or FORWARD."""
         media = self.media
         end = find_end(media, segment.ray, segment.medium, active)
         passed = RaySegment(segment.ray, segment.medium, end.t)

@@ -1,4 +1,4 @@
-r"""Emission-absorption rendering of an octree along rays, exact for its constant leaves, and its derivatives.
+r"""Emission-absorption rendering of an octree along rays, exact for its constant leaves, and the derivatives.
 
 .. math:: L = \sum_i T_i (1 - e^{-\tau_i})\, c_i, \qquad T_{i+1} = T_i e^{-\tau_i}, \qquad \tau_i = \sigma_i\, \Delta_i
 

@@ -1,4 +1,4 @@
-r"""Emission-absorption rendering of a radiance field along rays, and its derivatives by a sweep back along the rays.
+r"""Emission-absorption rendering of a radiance field along rays, and the derivatives by a sweep back along the rays.
 
 .. math:: L = \sum_i T_i\, S_i, \qquad T_{i+1} = T_i e^{-\tau_i}, \qquad S_i = \alpha_i \big( f c_1 + (1 - f) c_2 \big)
 
@@ -175,7 +175,7 @@ class _PointValues:
     """Extinction and colour at the two points of a cell.
 
     Attributes:
-        sigma, sigma_slope: extinction, and its derivative by the interpolated density.
+        sigma, sigma_slope: extinction, and the derivative by the interpolated density.
         colour, is_positive: colour, and whether it lies above the clamp.
     """
 

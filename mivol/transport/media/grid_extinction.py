@@ -10,7 +10,7 @@ The optical depth has a tangent and a transpose:
 .. math:: \tau = \int_{t_0}^{t_1} \sigma(o + t\,\omega)\,dt = (A \sigma)_{ray}
 
 Along a line a trilinear function is a cubic in each cell, so two Gauss points a cell integrate it exactly. The sum over the
-cells is linear in the values at the nodes. ``A``, its tangent (``A`` again) and its transpose are visitors of the same walk.
+cells is linear in the values at the nodes. ``A``, its tangent (``A`` again) and the transpose are visitors of the same walk.
 Functions return optical depth instead of transmittance: in float32 exp(-tau) underflows to 0 beyond tau = 103.
 
 References: Amanatides & Woo 1987 (the walk); Abramowitz & Stegun 25.4.30 (Gauss points); De Man & Basu 2004 (matched
@@ -81,7 +81,7 @@ def integrate_tau(
 
     Args:
         lattice: values [1/length] of 1 or 3 channels, and their place. Derivatives (reverse and forward) reach
-            ``lattice.values``; outside its box the grid is vacuum.
+            ``lattice.values``; outside the box the grid is vacuum.
         o, d: world rays, |d| = 1; neither the rays nor ``t_max`` carry derivatives.
         t_max: end of the interval [0, t_max] of the ray [length]; may be infinite.
         active: lanes to integrate; the other lanes return 0.
@@ -234,7 +234,7 @@ def backproject_segment(
 
 
 class _OpticalDepth(dr.CustomOp):
-    """tau = A values, with its tangent and its transpose."""
+    """tau = A values, with its tangent and the transpose."""
 
     def eval(self, values: mi.Float, lattice: Lattice, segment: Segment, active: mi.Bool) -> list[mi.Float]:
         self.lattice, self.segment, self.active = lattice, segment, active

@@ -57,7 +57,7 @@ class MediumView:
         numbers: the constants among ``scale``, the coefficients of the extinction and the ``g`` of a stock ``hg``, as in
             ``mi.traverse``.
         stock_boxes: the boxes of stock grids of emission and albedo, by the pointer of the volume. Mitsuba repeats the border
-            of a stock grid outside its box, where mivol has no emission.
+            of a stock grid outside the box, where mivol has no emission.
         is_isotropic: whether the phase function is Mitsuba's ``isotropic``.
         asymmetry: the ``g`` of Mitsuba's ``hg`` [1], with derivatives; None for another phase function.
     """

@@ -1,4 +1,4 @@
-"""The optical depth of the media along a ray, with its tangent and its transpose.
+"""The optical depth of the media along a ray, with its tangent and the transpose.
 
 Conventions. Rows have a number for each channel of the extinction of the scene; spectra have a number for each colour.
 """

@@ -3,7 +3,7 @@ replays (reverse mode) or tangents (forward mode, and reverse mode for one numbe
 
 .. math:: L = \frac{1}{k} \sum_{j=1}^{k} L_j
 
-A path consists of a stem, from the camera to its first collision, and k branches, from there to their ends. The mean of the
+A path consists of a stem, from the camera to the first collision, and k branches, from there to their ends. The mean of the
 branches is the radiance arriving at the end of the stem. Many camera rays pass a volume without a collision and have a stem
 only; the few branches cause most of the noise of a gradient. Branches lie side by side in lanes, sorted by their length once it
 is known, so few lanes wait for their neighbours.

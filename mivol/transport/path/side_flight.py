@@ -69,7 +69,7 @@ class WeightedEmitterSample:
 
 @dataclass
 class SideFlightSamples:
-    """Random numbers of a side flight: for the lobe, for the flight, and the generator of the shadow ray at its end."""
+    """Random numbers of a side flight: for the lobe, for the flight, and the generator of the shadow ray at the end."""
 
     lobe: mi.Point2f
     flight: tuple[mi.Float, mi.UInt32]
@@ -81,7 +81,7 @@ class SideFlightLight(TrackedTerm):
 
     Args:
         value: radiance at the camera, attached to the phase functions and the emitter.
-        flown: factor with the derivatives of the transmittance of the flight and of the albedo at its end.
+        flown: factor with the derivatives of the transmittance of the flight and of the albedo at the end.
         active: lanes receiving light.
     """
 
@@ -104,8 +104,8 @@ class SideFlight:
     """A side flight.
 
     Attributes:
-        light: light at its end.
-        shadow: shadow ray at its end.
+        light: light at the end.
+        shadow: shadow ray at the end.
         chance: uniform random number in [0, 1), by which a shadow ray of the path is kept for derivatives; None in images.
         tabulated: the same shadow ray with its shadow read from a table; None without a table.
     """

@@ -141,7 +141,7 @@ class Path:
 
 @dataclass
 class PathStart:
-    """The start of a path, at the camera or at its first collision with a medium.
+    """The start of a path, at the camera or at the first collision with a medium.
 
     Attributes:
         ray: camera ray, ended at the sensor's ``far_clip``, or the ray of the segment that ends at the collision.
@@ -217,7 +217,7 @@ def start_path(
     sampler: mi.Sampler | SpreadSampler,
     active: mi.Bool,
 ) -> Path:
-    """A path before its first segment, outside all media."""
+    """A path before the first segment, outside all media."""
     n = dr.width(ray)
     return Path(
         ray=FineRay.from_ray(ray),
@@ -399,7 +399,7 @@ def walk_in_kernel(
 
 
 def advance_path(estimators: Estimators, path: Path, collision: Collision | None = None, stops: mi.Bool | None = None) -> Path:
-    """Follow a path along its next segment and across the event at its end.
+    """Follow a path along its next segment and across the event at the end.
 
     Args:
         estimators: estimators of the render.

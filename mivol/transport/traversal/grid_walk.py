@@ -422,7 +422,7 @@ def walk_planes(
     Args:
         grid: the planes between the cells.
         o, d: start in the box, and unit direction, in the world.
-        length: length of the passage, up to its end in the box [length].
+        length: length of the passage, up to the end in the box [length].
         visit: ``visit(state, cell, t0, t1, active) -> state``, with the interval of the cell [length]; called once, while
             Dr.Jit traces the loop.
         state: any PyTree of Dr.Jit arrays.

@@ -11,7 +11,7 @@ Ratio tracking gives the transmittance of the box towards emitters, with its der
 size, never divides by sigma (which may be 0), and walks no path twice. It shares only Mitsuba's shapes, emitters, BSDFs and
 phase functions with :mod:`mivol`.
 
-Control variates. The weight at the end of a path has the mean 1 for every sigma, and its derivative has the mean 0. The terms
+Control variates. The weight at the end of a path has the mean 1 for every sigma, and the derivative has the mean 0. The terms
 w g' have the mean 0 too, given the path before them. They are summed over the flights after each number of scatterings, times
 the remaining albedo and BSDF values. A regression on separate paths finds the multiples of these sums whose subtraction leaves
 the smallest variance.
@@ -96,7 +96,7 @@ class _Path:
 
     Attributes:
         rng, ray, on: random numbers, the next ray, active lanes.
-        w, dw: weight and its derivative.
+        w, dw: weight and the derivative.
         a: product of albedos and BSDF values.
         light, derivative: radiance so far, derivative.
         depth: number of scatterings.
@@ -192,7 +192,7 @@ class Twin:
         return p
 
     def _at(self, x: mi.Point3f) -> tuple[mi.Float, mi.Float]:
-        """Extinction at a point, and its derivative."""
+        """Extinction at a point, and the derivative."""
         sigma, rate = self.field.eval(0.5 * x + 0.5)
         return sigma, rate
 
@@ -246,7 +246,7 @@ class Twin:
         return p
 
     def _transmittance(self, rng: mi.PCG32, x: mi.Point3f, ds: mi.DirectionSample3f, on: mi.Bool) -> tuple:
-        """Transmittance of the box from x to an emitter, and its derivative, by ratio tracking."""
+        """Transmittance of the box from x to an emitter, and the derivative, by ratio tracking."""
         d, majorant = ds.d, self.majorant
         leaves = dr.min((dr.select(d > 0, 1.0, -1.0) - x) / dr.select(d == 0, 1e-20, d))
         end = dr.minimum(leaves, ds.dist)

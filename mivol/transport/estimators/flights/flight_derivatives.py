@@ -3,7 +3,7 @@ r"""Derivatives of free flights, with respect to the coefficients of media along
 .. math:: \partial L = \int_0^D T \left( \partial\sigma\,(\alpha L_s - L_t) + \sigma\,\partial\alpha\,L_s \right) dt
 
 with the in-scattered radiance L_s at t, and the radiance L_t arriving at t from further along the ray. A flight of length t
-with the radiance L at its end estimates this derivative by
+with the radiance L at the end estimates this derivative by
 
 .. math:: -\int_0^t (L - b)\,\partial\sigma\,dt' + (L - b)\,\frac{\partial\sigma(t)}{\sigma(t) + \kappa}\,[\text{collision}]
           + \ell\,(\alpha \hat L_s - b)\,\frac{\kappa\,\partial\sigma(s)}{\sigma(s) + \kappa}

@@ -1,4 +1,4 @@
-r"""Free flights: a path flies to its first collision with the media, where it may scatter, or to the end of its segment.
+r"""Free flights: a path flies to the first collision with the media, where it may scatter, or to the end of its segment.
 
 .. math:: L = \int_0^D T(t) \left( \sigma_s L_s + j \right) dt + T(D)\, L_{behind}, \qquad p(t) = \sigma_t(t)\,T(t)
 

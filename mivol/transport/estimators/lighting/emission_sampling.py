@@ -121,7 +121,7 @@ class RayPoint:
         pdf: density of the ray's direction [1/sr].
         t: distance of the point [length].
         density: density of the point along the ray [1/length]; 0 for a ray beside all boxes.
-        box: index of its box.
+        box: index of the box.
     """
 
     pdf: mi.Float

@@ -1,4 +1,4 @@
-r"""The derivative of the optical depth of a shadow ray with respect to the position of the emitter at its end.
+r"""The derivative of the optical depth of a shadow ray with respect to the position of the emitter at the end.
 
 .. math:: \frac{\partial \tau}{\partial l} = \frac{\tau}{L}\,\omega + \int_0^L \frac{t}{L} \nabla\sigma\,dt
           \mp \sum_{faces} \frac{t_f}{L}\,\sigma(t_f) \frac{n}{n \cdot \omega}

@@ -85,7 +85,7 @@ def find_transmittance(
 def estimate_transmittance(
     media: SceneMedia, ray: Ray, medium: mi.MediumPtr, active: mi.Bool, rng: mi.UInt32, passes_null: bool = False
 ) -> tuple[SegmentEnd, mi.Spectrum]:
-    """Follow a ray to its end, and estimate the transmittance of its media without bias, with the random numbers of ``rng``."""
+    """Follow a ray to the end, and estimate the transmittance of its media without bias, with the random numbers of ``rng``."""
     start = ([mi.Float(1) for _ in range(media.channels)], rng)
     end, (T, _) = visit_media(media, ray, medium, _multiply_transmittance, start, active, passes_null)
     return end, to_spectrum(T)

@@ -8,7 +8,7 @@ Shadows from the table alone are biased.
 
 The light of a path in media is the sum of f T over many vertices, and walking a shadow ray takes most of the time of a vertex.
 So a path keeps one vertex c of its vertices k, with a probability w_c / w in proportion to its light by the table (weighted
-reservoir sampling), and at its end follows the exact shadow ray of this vertex alone. The mean is that of all shadow rays. If
+reservoir sampling), and at the end follows the exact shadow ray of this vertex alone. The mean is that of all shadow rays. If
 the table is right, w is their sum, so the noise is that of the path. T_0 bounds the weight of light where the table is dark.
 
 References: Chao 1982 (weighted reservoir sampling); Talbot et al. 2005 (resampling in proportion to approximate light).

@@ -253,7 +253,7 @@ def _interaction_at(p: mi.Point3f, direction: mi.Vector3f) -> mi.MediumInteracti
 def find_constant_control(media: SceneMedia) -> mi.Spectrum | None:
     r"""Find the constant source function S: the mean albedo times the radiance of a constant sky [radiance].
 
-    The light of S along a ray is :math:`S (1 - T(D))`, and its derivative by the optical depth of any part of the ray is
+    The light of S along a ray is :math:`S (1 - T(D))`, and the derivative by the optical depth of any part of the ray is
     :math:`T(D)\,S`. It needs no lattice, and serves any number of media in any boundaries.
 
     Returns:

@@ -159,7 +159,7 @@ def _start_candidate(media: SceneMedia, rng: mi.UInt32, width: int) -> Candidate
 def fill_reservoir(
     proposal: DistanceProposal, medium: mi.MediumPtr, reservoir: Reservoir, active: mi.Bool
 ) -> tuple[SegmentEnd, Reservoir]:
-    """Follow a ray to its end, sum the optical depth, and offer each cell or region of constant extinction to a reservoir as a
+    """Follow a ray to the end, sum the optical depth, and offer each cell or region of constant extinction to a reservoir as a
     piece.
 
     The :class:`Reservoir` keeps one piece for each candidate, in proportion to the light extinguished in the piece.

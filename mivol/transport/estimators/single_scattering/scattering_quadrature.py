@@ -59,7 +59,7 @@ MAX_PIECE_ANGLE = 0.1
 """Largest angle of a piece seen from a near emitter [rad] (the integrand 1/r^2 dt is constant in this angle)."""
 
 MAX_PIECES = 256
-"""Largest number of pieces of a cell, or of a region of constant extinction, cut up to its end."""
+"""Largest number of pieces of a cell, or of a region of constant extinction, cut up to the end."""
 
 DEEP_PIECES = 2 * int(NEGLIGIBLE_TAU / MAX_PIECE_TAU)
 """Pieces of a deeper cell between the positions where successive channels become dark. Their lengths are equal, so there are

@@ -1,9 +1,9 @@
-r"""Single scattering along a segment: Monte Carlo integration of the in-scattered radiance, and its derivatives.
+r"""Single scattering along a segment: Monte Carlo integration of the in-scattered radiance, and the derivatives.
 
 .. math:: L = \int_0^D T(t)\,\sigma_s(x_t)\,L_d(x_t, \omega)\,dt \approx \frac{T \sigma_s L_d}{p(t)}
 
 Conventions. One walk of the segment finds its optical depth and its scattering points. The weight of a point is T L_d / p, the
-radiance at the camera for a scattering coefficient of 1. The light is ``sigma_s * weight``, and its derivative with respect to
+radiance at the camera for a scattering coefficient of 1. The light is ``sigma_s * weight``, and the derivative with respect to
 sigma_s is the weight itself, so nothing is divided by an extinction or an albedo of possibly 0.
 
 Derivatives. A probe is a scattering event drawn also in regions without extinction. It
@@ -473,7 +473,7 @@ class SingleScattering:
         return SegmentEstimate(flight.end, T, term, Transmittance(self.media, passed, active))
 
     def _walk(self, segment: PathSegment, count: int, probe_depth: float, active: mi.Bool) -> _WalkedSegment:
-        """Choose an emitter, walk the segment to its end, and fill a reservoir with candidates of scattering points."""
+        """Choose an emitter, walk the segment to the end, and fill a reservoir with candidates of scattering points."""
         ray, samples = segment.ray, segment.samples
         chosen = self.emitters.choose_emitter(ray, samples.which_emitter)
         reservoir = start_reservoir(self.media, [fork_state(samples.generator, k) for k in range(count)])
