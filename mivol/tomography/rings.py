@@ -35,6 +35,12 @@ ARCS, FEWEST_ARCS, VIEWS_OF_ARC = 9, 3, 16
 GAIN_DEVIATIONS = 3.0
 """Standard errors above which gains count as found; scans without rings have up to 1.6."""
 
+COLUMN_DEVIATIONS = 5.0
+"""Deviations above which the offset of a single column counts as a gain: by chance one in 10,000; 6 leave more rings."""
+
+ROUNDING = 1e-10
+"""Deviation of an offset by rounding, at least."""
+
 ERROR_COLUMNS = 5
 """Columns over which the variance of an offset's error is averaged."""
 
@@ -97,22 +103,30 @@ def _subtract_gains(y: np.ndarray, width: int) -> np.ndarray:
     return y - offsets
 
 
-def _share_of_gains(offsets: np.ndarray) -> np.ndarray | float:
+def _share_of_gains(offsets: np.ndarray) -> np.ndarray:
     """Share of each column's offset that gains explain, from its offsets in arcs of the scan (arcs, cols).
 
     A gain is the same in all arcs; a detail of the object moves to other columns. So the variance of gains is the mean square
-    of the columns' mean offsets, less the variance of the means between arcs. The best linear estimate of a gain is its offset
-    times ``gains / (gains + errors)``.
+    of the columns' mean offsets, less the variance of these means between arcs. The best linear estimate of a gain is its
+    offset times ``gains / (gains + errors)``.
+
+    A few faulty columns hardly raise the variance of all. So a column whose offset exceeds ``COLUMN_DEVIATIONS`` of its own
+    deviations counts for itself.
 
     Returns:
-        (cols,); 0 if the gains do not exceed ``GAIN_DEVIATIONS`` standard errors.
+        (cols,); 0 without such a column if the gains of all do not exceed ``GAIN_DEVIATIONS`` standard errors.
     """
-    squares, errors = np.mean(offsets, axis=0) ** 2, np.var(offsets, axis=0, ddof=1) / len(offsets)
-    excess = squares - errors
+    squares, variances = np.mean(offsets, axis=0) ** 2, np.var(offsets, axis=0, ddof=1) / len(offsets)
+    # Arcs of a noiseless scan may agree to rounding.
+    errors = np.maximum(uniform_filter1d(variances, ERROR_COLUMNS, mode="nearest"), ROUNDING**2)
+    # Few arcs may agree by chance in a few neighbours: an error counts as at least the median of all.
+    is_own = squares > COLUMN_DEVIATIONS**2 * np.maximum(errors, np.median(variances))
+    own = np.where(is_own, 1 - errors / np.where(is_own, squares, 1), 0)
+    excess = squares - variances
     gains = excess.mean()
     if gains <= GAIN_DEVIATIONS * excess.std() / np.sqrt(len(excess)):
-        return 0.0
-    return gains / (gains + uniform_filter1d(errors, ERROR_COLUMNS, mode="nearest"))
+        return own
+    return np.maximum(gains / (gains + errors), own)
 
 
 def _find_offsets(y: np.ndarray, width: int) -> np.ndarray:
