@@ -4,6 +4,8 @@ Dr.Jit compiles a virtual call for the plugins that live at the moment of record
 between two calls, Dr.Jit 1.5.0 records the first call for several plugins and the second for one. If the code of these plugins
 is the same, Dr.Jit emits the same function twice, LLVM refuses the kernel ("invalid redefinition of function"), and the process
 aborts: callables of several targets and of one target have different keys (``GlobalKey`` in drjit-core) but the same name.
+If the collector frees a scene of Mitsuba while Dr.Jit records, the process aborts as well: the call that frees the scene's tree
+"cannot be recorded".
 """
 
 from __future__ import annotations
@@ -30,15 +32,38 @@ def is_recording() -> bool:
     return bool(dr.flag(dr.JitFlag.FreezingScope))
 
 
-def record_kernels(function: Callable, *settings: Any) -> Callable:
-    """``dr.freeze`` of a function with its first arguments given.
+@contextmanager
+def without_garbage_collection() -> Iterator[None]:
+    """Pause Python's automatic garbage collection inside a ``with`` block."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+class RecordedKernel:
+    """``dr.freeze`` of a function with its first arguments given, without garbage collection in the calls.
 
     Args:
         function: function of a module. ``dr.freeze`` keeps it in a reference cycle: a method would keep its object, with all
             recorded kernels, until Python's collector runs.
         settings: first arguments, without arrays.
     """
-    return dr.freeze(lambda *given: function(*settings, *given))
+
+    def __init__(self, function: Callable, *settings: Any) -> None:
+        self._frozen = dr.freeze(lambda *given: function(*settings, *given))
+
+    @property
+    def n_recordings(self) -> int:
+        """Number of recordings made so far."""
+        return self._frozen.n_recordings
+
+    def __call__(self, *given: Any) -> Any:
+        with without_garbage_collection():
+            return self._frozen(*given)
 
 
 def begin_kernel(*inputs: Any) -> None:
@@ -139,7 +164,8 @@ class Recordings:
         self._tasks[kind, key] = task
         self._tasks = dict(list(self._tasks.items())[-self.most :])
         try:
-            return self._frozen({"task": task, "inputs": inputs})
+            with without_garbage_collection():
+                return self._frozen({"task": task, "inputs": inputs})
         except RuntimeError as error:
             if task.is_interrupted:
                 raise KeyboardInterrupt from None
@@ -254,18 +280,6 @@ def _run_task(given: dict[str, Any]) -> Any:
     except BaseException as error:
         task.failure, task.is_interrupted = str(error), isinstance(error, KeyboardInterrupt)
         raise
-
-
-@contextmanager
-def without_garbage_collection() -> Iterator[None]:
-    """Pause Python's automatic garbage collection inside a ``with`` block."""
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
 
 
 def copy_aligned(array: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ import numpy as np
 
 from mivol.back_end import free_memory
 from mivol.errors import MivolError
-from mivol.kernel_recording import copy_aligned, ensure_aligned, record_kernels
+from mivol.kernel_recording import RecordedKernel, copy_aligned, ensure_aligned
 from mivol.photos.camera import Camera
 from mivol.points import Gaussians
 from mivol.splatting.compositing import CHUNK, LANES, PIXELS, Adjoint, Frame, Lists, composite, composite_adjoint
@@ -144,9 +144,9 @@ class Splatter:
         self._filter = Filter(*(dr.opaque(mi.Float, value) for value in (low_pass * scale**2, near, sheen)))
         self._grid = Grid(dr.opaque(mi.Int32, columns), dr.opaque(mi.Int32, rows), dr.opaque(mi.Float, least_alpha))
         self._width, self._height = dr.opaque(mi.UInt32, width), dr.opaque(mi.UInt32, height)
-        self._project = record_kernels(_trace_projection, degree, compensated)
-        self._write, self._composite = dr.freeze(write_tiles), dr.freeze(composite)
-        self._project_adjoint = record_kernels(_trace_adjoint, degree, compensated)
+        self._project = RecordedKernel(_trace_projection, degree, compensated)
+        self._write, self._composite = RecordedKernel(write_tiles), RecordedKernel(composite)
+        self._project_adjoint = RecordedKernel(_trace_adjoint, degree, compensated)
         # A recording holds the size of the target and of the copies of it that each thread adds to.
         self._composite_adjoints: dict[tuple[int, int], Callable[..., Adjoint]] = {}
 
@@ -229,7 +229,7 @@ class Splatter:
         adjoint = Adjoint(dr.detach(d_image.array), cache.chunks, *zeros)
         size = _capacity(n), dr.thread_count()
         if size not in self._composite_adjoints:
-            self._composite_adjoints[size] = dr.freeze(composite_adjoint)
+            self._composite_adjoints[size] = RecordedKernel(composite_adjoint)
         adjoint = self._composite_adjoints[size]((cache.shape, cache.rest), cache.lists, self._grid, cache.frame, adjoint)
         target = Cloud(*[_opaque_zeros(int(np.prod(cache.shapes[name]))) for name in NAMES])
         d_cloud, by_pose, d_mean2d = self._project_adjoint(cache.cloud, cache.view, self._filter, adjoint, target)

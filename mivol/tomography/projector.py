@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.kernel_recording import copy_aligned, record_kernels
+from mivol.kernel_recording import RecordedKernel, copy_aligned
 from mivol.threads import check_one_thread, lend_ownership
 from mivol.tomography.column_integral import (
     ColumnGrid,
@@ -455,9 +455,9 @@ class RecordedKernels:
         # The recording of the transpose includes a buffer with a copy per thread.
         self._threads = dr.thread_count()
         shape = self.grid.shape
-        self._integrate = record_kernels(_trace_integral, shape)
-        self._backproject = record_kernels(_trace_backprojection, shape)
-        self._pad = record_kernels(_pad_columns, ColumnGrid(shape, 2))
+        self._integrate = RecordedKernel(_trace_integral, shape)
+        self._backproject = RecordedKernel(_trace_backprojection, shape)
+        self._pad = RecordedKernel(_pad_columns, ColumnGrid(shape, 2))
         self._columns: dict[str, Callable] = {}
 
     def _renew(self) -> None:
@@ -491,7 +491,7 @@ class RecordedKernels:
     def _by_columns(self, name: str, trace: Callable, given: mi.Float, o: mi.Point3f, d: mi.Vector3f, along: int) -> mi.Float:
         self._renew()
         if name not in self._columns:
-            self._columns[name] = record_kernels(trace, ColumnGrid(self.grid.shape, along))
+            self._columns[name] = RecordedKernel(trace, ColumnGrid(self.grid.shape, along))
         return self._columns[name](given, o, d, self._from_world)
 
 

@@ -23,7 +23,7 @@ import numpy as np
 import scipy.sparse
 
 from mivol.errors import MivolError
-from mivol.kernel_recording import copy_aligned, record_kernels
+from mivol.kernel_recording import RecordedKernel, copy_aligned
 from mivol.tomography.geometry import Geometry, VoxelGrid
 from mivol.tomography.projector import Projector
 
@@ -323,7 +323,7 @@ class _Rows:
 
 @cache
 def _record_products(width: int) -> tuple[Callable, Callable]:
-    return record_kernels(_pack_layers, width), record_kernels(_multiply_layers, width)
+    return RecordedKernel(_pack_layers, width), RecordedKernel(_multiply_layers, width)
 
 
 def _pack_layers(width: int, packed: mi.Float, given: mi.Float, first: mi.UInt32, count: mi.UInt32, n: mi.UInt32) -> mi.Float:

@@ -10,6 +10,7 @@ import gc
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import drjit as dr
@@ -24,6 +25,7 @@ from mivol.errors import MivolError
 from mivol.kernel_recording import (
     CannotRecordError,
     RecordedFunctions,
+    RecordedKernel,
     RecordedTask,
     Recordings,
     copy_aligned,
@@ -817,6 +819,19 @@ def test_collections_are_put_off_for_a_while() -> None:
         assert not gc.isenabled()
     finally:
         gc.enable()
+
+
+def _look_at_collector(seen: list[bool], x: mi.Float) -> mi.Float:
+    seen.append(gc.isenabled())
+    return x + 1
+
+
+@pytest.mark.parametrize("records", [RecordedKernel, lambda *given: partial(RecordedFunctions().call, *given)])
+def test_kernels_are_recorded_without_them(variant_rgb: str, records: Callable) -> None:
+    """A scene that the collector frees in a recording would end the process."""
+    seen: list[bool] = []
+    one = records(partial(_look_at_collector, seen))(dr.opaque(mi.Float, 1, 3))
+    assert seen == [False] and gc.isenabled() and np.array_equal(one, [2, 2, 2])
 
 
 @pytest.mark.slow_for("forward", "reverse")

@@ -20,6 +20,7 @@ import numpy as np
 from scipy.special import expit
 
 from mivol.errors import MivolError
+from mivol.kernel_recording import RecordedKernel
 from mivol.optim.gaussians.density_control import (
     CloudArrays,
     CloudChange,
@@ -116,7 +117,7 @@ class GaussianProblem(StagedProblem, DividedProblem):
         self._shapes: dict[tuple[int, int], ImageShape] = {}
         self._cameras: dict[tuple[int, int], Camera] = {}
         self._order: tuple[int, np.ndarray] | None = None
-        self._image_loss = dr.freeze(image_loss)
+        self._image_loss = RecordedKernel(image_loss)
         self.cloud = _with_degree(self.cloud, self.plan.stages[0].degree)
         self._reset_statistics()
 

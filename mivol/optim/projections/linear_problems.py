@@ -25,7 +25,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.kernel_recording import record_kernels
+from mivol.kernel_recording import RecordedKernel
 from mivol.tomography.projector import Projector
 from mivol.tomography.rings import PixelGains
 
@@ -320,7 +320,7 @@ KERNEL_VOXELS = 1 << 22
 
 @cache
 def _record(function: Callable) -> Callable:
-    return record_kernels(function)
+    return RecordedKernel(function)
 
 
 @dataclass
