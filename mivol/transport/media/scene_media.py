@@ -247,7 +247,8 @@ class SceneMedia:
     def start_unit_tangent(self) -> None:
         """Begin a forward pass along :meth:`find_only_constant`, with a tangent of 1 in every channel."""
         for body in self.bodies:
-            body.has_tangent, body.tangents = body.follows, [type(part.values)(1) for part in body.view.parts]
+            parts = zip(body.view.parts, body.follows, strict=True)
+            body.has_tangent, body.tangents = body.follows, [type(part.values)(1) if on else None for part, on in parts]
             if body.follows_albedo and body.view.albedo is not None:
                 with dr.resume_grad():
                     albedo = dr.detach(body.view.albedo)
