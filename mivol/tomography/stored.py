@@ -63,8 +63,9 @@ class StoredProjector(Projector):
 
     def subset(self, views: Sequence[int] | np.ndarray) -> StoredProjector:
         """Select the rows of some views, counted among this projector's own, in the same memory."""
+        walk = super().subset(views)  # checks the numbers
         matrix = self._matrix.select_views(np.asarray(views, int), self.projection_shape[2])
-        return StoredProjector(super().subset(views), matrix, self._to_rows)
+        return StoredProjector(walk, matrix, self._to_rows)
 
     def _project_array(self, x: np.ndarray) -> np.ndarray:
         layers = x.reshape(self.grid.shape[0], -1)

@@ -79,6 +79,7 @@ def test_a_subset_is_the_rows_of_its_views(monkeypatch: pytest.MonkeyPatch, prod
     part = a.subset([4, 0, 1])
     np.testing.assert_array_equal(part @ x, (a @ x)[[4, 0, 1]])
     np.testing.assert_array_equal(part.subset([2]) @ x, (a @ x)[[1]])
+    assert_refused("view 3, expected views from 0 to 2", part.subset, [3])
     spread = np.zeros(a.projection_shape, np.float32)
     spread[[4, 0, 1]] = y
     # Sums in another order: float32 rounding of 3 views of 63 rays.

@@ -328,6 +328,9 @@ MITSUBAS_SCENES = {
 }
 """Scenes of Mitsuba's own tests, with the parameters of their gradients: measured on demand."""
 
+ALL_SCENES = SCENES | MITSUBAS_SCENES
+"""All scenes that can be named."""
+
 
 # -- The contest -------------------------------------------------------------------------------------------------------
 
@@ -360,11 +363,10 @@ def chosen_scenes(names: Sequence[str]) -> dict[str, EverydayScene]:
     Raises:
         MivolError: an unknown scene.
     """
-    known = SCENES | MITSUBAS_SCENES
     for name in names:
-        if name not in known:
-            raise MivolError(f'there is no scene "{name}": {suggest_name(name, known)}')
-    return {name: known[name] for name in names}
+        if name not in ALL_SCENES:
+            raise MivolError(f'there is no scene "{name}": {suggest_name(name, ALL_SCENES)}')
+    return {name: ALL_SCENES[name] for name in names}
 
 
 def measure_images(size: EverydaySize) -> dict:
@@ -466,8 +468,8 @@ def promise(question: str, bars: dict[str, float | None], mean: float) -> list[P
 
 
 PROMISES = {
-    "images": promise("images", {name: scene.image_bar for name, scene in (SCENES | MITSUBAS_SCENES).items()}, 8),
-    "gradients": promise("gradients", {name: scene.gradient_bar for name, scene in (SCENES | MITSUBAS_SCENES).items()}, 5),
+    "images": promise("images", {name: scene.image_bar for name, scene in ALL_SCENES.items()}, 8),
+    "gradients": promise("gradients", {name: scene.gradient_bar for name, scene in ALL_SCENES.items()}, 5),
 }
 
 
