@@ -1,4 +1,4 @@
-"""Short representations of objects: one line without array contents, and small images for notebooks.
+"""Short representations of objects: one line without array contents, values as TOML, and small images for notebooks.
 
 Conventions. HTML is self-contained, has no script, and escapes its text.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import html
+import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -43,6 +44,16 @@ def summarize(value: object) -> str:
 def format_point(values: Iterable[float]) -> str:
     """Write coordinates with four digits: ``(1, 2.5, -0.3333)``."""
     return f"({', '.join(f'{value:.4g}' for value in values)})"
+
+
+def to_toml(value: object) -> str:
+    """Write a value of a setting as TOML does: lists and tables on one line, entries of None left out."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {to_toml(entry)}" for key, entry in value.items() if entry is not None) + " }"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(to_toml, value))}]"
+    # TOML writes inf and nan as Python does; JSON would write Infinity.
+    return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
 
 
 def with_short_repr(cls: type[T]) -> type[T]:

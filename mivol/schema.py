@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, ge
 
 import msgspec
 
+from mivol.display import to_toml
 from mivol.errors import MivolError
 from mivol.optim.strategy import setting, suggest_name
 
@@ -126,8 +127,8 @@ class Setting(NamedTuple):
     """A setting of a file.
 
     Attributes:
-        key: dotted key; an entry of a list has the number 0; a key of a choice has the choice's name in brackets.
-        default: default as Python writes it; "" for required settings and tables.
+        key: dotted key; an entry of a list has the number 0; names of choices that have the setting stand in brackets.
+        default: default as TOML writes it, or "absent"; "" for required settings and tables.
         domain: allowed numbers in words; "" for all.
         unit: unit; "1" for none.
         meaning: meaning in a line.
@@ -152,26 +153,34 @@ def describe_domain(meta: msgspec.Meta) -> str:
     return ", ".join(f"{words} {bound}" for words, bound in bounds.items() if bound is not None)
 
 
-def settings_in(kind: type, prefix: str = "") -> list[Setting]:
-    """Return every setting of a struct, of the tables in the struct and of the entries of lists."""
+def settings_in(kind: type) -> list[Setting]:
+    """Return every setting of a struct, of the tables in the struct and of the entries of lists.
+
+    Settings that are equal in several choices of a table are one setting.
+    """
     settings = []
     hints = get_type_hints(kind, include_extras=True)
     for field in msgspec.structs.fields(kind):
-        hint, key = hints[field.name], f"{prefix}{field.name}"
+        hint, key = hints[field.name], field.name
         described = next((part for part in (hint, *get_args(hint)) if hasattr(part, "__metadata__")), None)
         meta = described.__metadata__[0] if described else setting("1", "one of " + ", ".join(map(str, get_args(hint))))
         inner = getattr(hint, "__origin__", hint) if described is hint else hint
         many = get_origin(inner) is tuple and bool(structs_in(get_args(inner)[0]))
         structs = structs_in(get_args(inner)[0] if many else inner)
-        default = "" if field.default is msgspec.NODEFAULT or structs else repr(field.default)
+        unset = field.default is msgspec.NODEFAULT or structs
+        default = "" if unset else "absent" if field.default is None else to_toml(field.default)
         tags = tuple(str(s.__struct_config__.tag) for s in structs if s.__struct_config__.tag is not None)
         choices = tags or tuple(filter(None, words_in(inner)))
         domain = describe_domain(meta)
         settings.append(Setting(key, default, domain, meta.extra["unit"], meta.description, choices, bool(structs)))
         key += ".0" * many
+        owners: dict[Setting, list[str]] = {}
         for struct in structs:
-            label = struct.__struct_config__.tag
-            settings += settings_in(struct, f"{key}[{label}]." if label else f"{key}.")
+            for inner_setting in settings_in(struct):
+                owners.setdefault(inner_setting, []).append(struct.__struct_config__.tag)
+        for inner_setting, names in owners.items():
+            choice = f"[{','.join(names)}]" if names[0] else ""
+            settings.append(inner_setting._replace(key=f"{key}{choice}.{inner_setting.key}"))
     return settings
 
 

@@ -29,13 +29,13 @@ from PIL import Image
 ROOT = Path(__file__).resolve().parents[1]
 PAGE, PICTURES, RUNS = ROOT / "docs" / "gallery.md", ROOT / "docs" / "gallery", ROOT / "runs" / "gallery"
 HEIGHT, QUALITY = 240, 88
-"""Of a picture [pixel], and of its JPEG."""
+"""Height of a picture [pixel], and quality of its JPEG file."""
 
 HEAD = """# Gallery
 
-Each picture is made by `scripts/gallery.py --draw` from an example at small settings, with a procedural stand-in where the
-example shows public data (`mivol fetch NAME` brings that). The command below it is the example in full; `scenes/NAME/README.md`
-says more.
+`scripts/gallery.py --draw` made each picture from an example with small settings. If an example uses public data, the picture
+shows procedural data instead (`mivol fetch NAME` downloads the public data). The command below a picture runs the example with
+its own settings; `scenes/NAME/README.md` describes it.
 
 """
 
@@ -46,7 +46,7 @@ def drawn(name: str) -> Callable[[Path], list[Image.Image]]:
 
 
 def compared(folder: Path) -> list[Image.Image]:
-    """What a run's first judged view was and is, and the same of a slice of its volume where the truth is known."""
+    """The first held-out view of a run beside its reference, and a slice of its volume beside the true volume if known."""
     record = read_record(folder)
     views = make_view_rows(folder, [image for image in record.images if image.view and image.held_out]).rows
     rows = [views[0].pictures[:2]] if views else []
@@ -64,10 +64,10 @@ class Entry(NamedTuple):
     """An example of the gallery.
 
     Attributes:
-        title, text: above its picture and below it.
-        command: the example in full, as the page prints it.
-        runs: what is run for the picture, by its words; ``{out}`` is the folder of the run.
-        pictures: what is shown of that folder, side by side.
+        title, text: heading above the picture, text below it.
+        command: command of the example, as the page prints it.
+        runs: arguments of Python for the picture; ``{out}`` is the folder of the run.
+        pictures: reads images from that folder, to show side by side.
     """
 
     title: str
@@ -77,7 +77,7 @@ class Entry(NamedTuple):
     pictures: Callable[[Path], list[Image.Image]] = compared
 
 
-PAIRS = "From the left: a view that took no part, by Mitsuba and by mivol; a slice of the true volume, and of what was found."
+PAIRS = "From the left: a held-out view by Mitsuba and by mivol; a slice of the true and of the reconstructed volume."
 PHOTOS = "photographs.py --views 40 --size 96 --spp 32 -o {out}/photographs"
 
 ENTRIES = {
@@ -95,13 +95,13 @@ ENTRIES = {
     ),
     "shepp_logan": Entry(
         "A phantom by cone beam",
-        "A projection that took no part, measured and modelled, and a slice of the truth and of the reconstruction.",
+        "From the left: a held-out projection, measured and modelled; a slice of the true and of the reconstructed volume.",
         "mivol demo shepp_logan",
         ("-m mivol optimize scenes/shepp_logan/fit.toml -o {out}",),
     ),
     "still_life": Entry(
         "A radiance field of photographs",
-        "The worst of the views that took no part, and what the field shows there.",
+        "The held-out photograph with the largest error, and the same view of the field.",
         "mivol demo still_life",
         (
             f"scenes/still_life/{PHOTOS}",
@@ -110,7 +110,7 @@ ENTRIES = {
     ),
     "gaussians": Entry(
         "Gaussians of the same photographs",
-        "The worst of the views that took no part, and its splats.",
+        "The held-out photograph with the largest error, and the same view of the Gaussians.",
         "mivol demo gaussians",
         (
             f"scenes/still_life/{PHOTOS}",
@@ -120,42 +120,42 @@ ENTRIES = {
     ),
     "fog": Entry(
         "Gaussians in fog",
-        "Rays are traced through them: they shine in the ball of steel, upside down in that of glass, and through the fog.",
+        "Rays are traced through the Gaussians, also by a ball of steel, by a ball of glass (upside down), and through fog.",
         "python scenes/fog/render.py",
         ("scenes/fog/render.py --size 180 --spp 32 -o {out}",),
         drawn("fog.png"),
     ),
     "knot": Entry(
         "A knot of needles under a lamp",
-        "Gaussians as the extinction of a medium: they scatter light, and shadow each other and the floor.",
+        "The Gaussians are the extinction of a medium: they scatter light, and cast shadows on each other and on the floor.",
         "python scenes/knot/render.py",
         ("scenes/knot/render.py --size 180 --spp 32 -o {out}",),
         drawn("knot.png"),
     ),
     "scan_view": Entry(
         "A scan through tables of opacity and colour",
-        "Lit by its gradient, with highlights, and boundaries stressed by a table of the gradient's magnitude.",
+        "The gradient of the volume shades its surfaces, and a table of the gradient's magnitude emphasises boundaries.",
         "python scenes/scan_view/tables.py",
         ("scenes/scan_view/tables.py --size 240 --spp 8 --iterations 1 -o {out}",),
         drawn("tooth.png"),
     ),
     "explosion": Entry(
         "An explosion, from a .vdb with density and temperature",
-        "Simulated, written as bricks, and rendered from the file: black bodies in soot that scatters, over a plain at dusk.",
+        "A simulation, written as bricks and rendered from the file: glowing gas in scattering soot, over a plain at dusk.",
         "python scenes/explosion/render.py",
         ("scenes/explosion/render.py --cells 80 --size 240 --spp 256 -o {out}",),
         drawn("explosion.png"),
     ),
     "fire": Entry(
         "A fire, from temperature and soot",
-        "Black bodies behind soot, over a floor that they light, at an exposure that is chosen from the picture.",
+        "Hot gas (black-body radiation) and soot; the fire lights the floor. The exposure is chosen from the picture.",
         "python scenes/fire/render.py",
         ("scenes/fire/render.py --size 240 --spp 64 -o {out}",),
         drawn("fire.png"),
     ),
     "big_cloud": Entry(
         "A cloud of 1024 x 1024 x 1024 voxels",
-        "Sparse in memory, under a sun and a sky; all scattering up to 47 times.",
+        "A sparse grid under a sun and a sky, with up to 47 scatterings.",
         "python scenes/big_cloud/render.py",
         ("scenes/big_cloud/render.py --voxels 512 --size 240 --spp 96 -o {out}",),
         drawn("cloud.png"),

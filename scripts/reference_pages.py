@@ -140,8 +140,8 @@ def verb_page() -> str:
 # -- Settings -------------------------------------------------------------------------------------------------------------
 
 
-def setting_rows(kind: type) -> list[tuple[str, str, str, str]]:
-    """Key, default, unit and meaning of every setting; what is chosen by its name says from which."""
+def setting_rows(kind: type) -> list[tuple[str, ...]]:
+    """Key, default, domain, unit and meaning of every setting."""
     from mivol.schema import settings_in
 
     rows = []
@@ -157,9 +157,10 @@ SETTINGS_HEAD = """\
 tables; other rows are settings, and a setting without a default is required. Paths are relative to the file.
 
 `--set parameter.0.lr=0.2` on the command line overrides the file; the first entry of a list has the number 0.
-`optimizer[adam].beta_1` exists for `optimizer = { name = "adam" }` only. The key for the choice is `name`, but `rig` for views,
-`source` for references and data, and `beam` for scans. An unknown key is an error, whose message names the most similar key.
-`mivol optimize --settings` prints this list.
+`optimizer[adam].beta_1` exists for `optimizer = { name = "adam" }` only, and `views[ring,hemisphere].distance` for two kinds of
+views. The key for the choice is `name`, but `rig` for views, `source` for references and data, and `beam` for scans. An unknown
+key is an error, whose message names the most similar key. `mivol optimize --settings WORD` prints the settings with a word in
+their names.
 """
 
 
@@ -178,7 +179,16 @@ def toml_page() -> str:
     }
     lines = ["# Settings of an experiment", "", *SETTINGS_HEAD.splitlines(), ""]
     for title, kind in kinds.items():
-        lines += [f"## {title}", "", *table(("key", "default", "domain", "unit", "meaning"), setting_rows(kind))]
+        rows = setting_rows(kind)
+        lines += [f"## {title}", ""]
+        if kind not in (config.SceneExperiment, config.ScanExperiment, config.FieldExperiment):
+            shared = setting_rows(config.FieldExperiment)
+            rows = [row for row in rows if row not in shared or row[0].startswith(("`field", "`gaussians"))]
+            lines += [
+                "`[photos]`, `[show]` and the keys without a table are as in the section *Photographs*, except for this table:",
+                "",
+            ]
+        lines += table(("key", "default", "domain", "unit", "meaning"), rows)
     return page(lines)
 
 

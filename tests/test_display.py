@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import io
+import math
 import re
+import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +19,7 @@ from PIL import Image
 from tiny_experiment import write_experiment
 
 import mivol
-from mivol.display import curve_html, summarize, with_short_repr
+from mivol.display import curve_html, summarize, to_toml, with_short_repr
 from mivol.experiments.script import Problem, optimize
 from mivol.files import VolumeData
 from mivol.files.image_files import EDGE, GAP, pairs_html
@@ -35,6 +37,13 @@ class Thing:
     about: dict[str, int]
     _own: int = 3
     hidden: int = field(default=1, repr=False)
+
+
+def test_values_as_toml_read_back() -> None:
+    """TOML has no null, so None is left out of tables; paths keep their backslashes."""
+    value = {"domain": (0.0, math.inf), "name": 'C:\\runs\\"näher"', "steps": [{"at": (5, 7), "end": None}], "on": True}
+    expected = {"domain": [0.0, math.inf], "name": 'C:\\runs\\"näher"', "steps": [{"at": [5, 7]}], "on": True}
+    assert tomllib.loads(f"value = {to_toml(value)}")["value"] == expected
 
 
 def test_values_in_a_few_words() -> None:

@@ -54,9 +54,10 @@ class TerminalProgress:
 
 
 def figures(fit: Fit, note: str = "") -> str:
-    """The newest loss and errors in words, and a note."""
-    errors = [(f"{value:.4g}", "", QUANTITIES.get(name, Quantity(name)).label) for name, value in fit.latest_errors().items()]
-    words = [f"{label} {numbers}" for numbers, _, label in join_channels(errors)]
+    """Describe the newest loss and errors, and add a note."""
+    known = [(value, QUANTITIES.get(name, Quantity(name))) for name, value in fit.latest_errors().items()]
+    errors = join_channels((f"{value:.4g}", quantity.unit, quantity.label) for value, quantity in known)
+    words = [f"{label} {numbers} {unit}".rstrip() for numbers, unit, label in errors]
     return ", ".join([f"loss {fit.history[-1]['loss']:.4g}", *words, *filter(None, [note])])
 
 

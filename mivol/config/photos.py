@@ -34,22 +34,23 @@ class Photographs(Section):
             "alpha, else the preset's, or black",
         ),
     ] = ""
-    held_out: Annotated[int, setting("view", "step between training views that are not fitted; 0: none", ge=0)] = 8
+    held_out: Annotated[int, setting("view", "every n-th training view is not fitted; 0: all are fitted", ge=0)] = 8
     fold: Annotated[
-        int, setting("view", "first of the views that are not fitted, below held_out: one fold of a cross-validation", ge=0)
+        int, setting("view", "number of the first view that is not fitted, below held_out: a fold of cross-validation", ge=0)
     ] = 0
     box: Annotated[
         str | tuple[Vector, Vector],
         setting(
             "1",
-            "box of the matter: silhouettes (around the opaque pixels), cameras (what they look at), middle (innermost of "
-            "nested boxes), found (silhouettes if all photographs have alpha, else cameras), or two corners [length]",
+            "box of the matter: silhouettes (around the opaque pixels), cameras (the region that cameras share), middle "
+            "(innermost of nested boxes), found (silhouettes if all photographs have alpha, else cameras), or two corners "
+            "[length]",
         ),
     ] = "found"
     judged: Annotated[str, setting("1", "views that judge the fit: held_out, val or test", min_length=1)] = "held_out"
     space: Annotated[
         Literal["srgb", "linear"] | None,
-        setting("1", "fitted values: srgb (codes) or linear (radiance); absent: as stored in the photographs"),
+        setting("1", "fitted values: srgb (code values) or linear (radiance); absent: as stored in the photographs"),
     ] = None
     stored: Annotated[
         Literal["srgb", "linear"] | None,
@@ -77,15 +78,19 @@ class FieldSettings(Section):
     degree: Annotated[int, setting("1", "degree of the spherical harmonics; absent: preset", ge=0, le=4)] | None = None
     first_degree: Annotated[int, setting("1", "degree of the first stage; absent: degree", ge=0, le=4)] | None = None
     effort: Annotated[float, setting("1", "factor on the preset's steps", gt=0)] = 1.0
-    tv_density: Annotated[float, setting("photograph", "total variation of the density; absent: preset", ge=0)] | None = None
-    tv_sh: Annotated[float, setting("photograph", "total variation of the colours; absent: preset", ge=0)] | None = None
-    sparsity: Annotated[float, setting("photograph", "sparsity of the density; absent: preset", ge=0)] | None = None
+    tv_density: (
+        Annotated[float, setting("photograph", "weight of total variation of the density; absent: preset", ge=0)] | None
+    ) = None
+    tv_sh: Annotated[float, setting("photograph", "weight of total variation of the colours; absent: preset", ge=0)] | None = (
+        None
+    )
+    sparsity: Annotated[float, setting("photograph", "weight of a prior for empty space; absent: preset", ge=0)] | None = None
     matte: (
         Annotated[
             float,
             setting(
                 "photograph",
-                "decay of view-dependent colours; absent: preset (capture with fewer than 50 photographs: 0)",
+                "weight decay of view-dependent colours; absent: preset (capture, fewer than 50 photographs: 0)",
                 ge=0,
             ),
         ]
@@ -107,9 +112,13 @@ class FieldSettings(Section):
         ]
         | None
     ) = None
-    sky: Annotated[int, setting("row", "rows of the fitted map behind the box; 0: none", ge=0, le=4096)] | None = None
+    sky: (
+        Annotated[int, setting("row", "rows of the fitted sky behind the boxes; 0: no sky; absent: preset", ge=0, le=4096)]
+        | None
+    ) = None
     exposure: Annotated[
-        bool | None, setting("1", "gains of each photograph, dropped if they agree; absent: preset (only capture)")
+        bool | None,
+        setting("1", "fit gains of each photograph, and drop them if exposures agree; absent: preset (only capture)"),
     ] = None
     poses: Annotated[bool, setting("1", "cameras move with the fit, for poses that are off by a pixel or more")] = False
     beta: Annotated[float, setting("1", "weight of a prior for rays of opacity 0 or 1; absent: preset", ge=0)] | None = None
@@ -171,15 +180,20 @@ class HashSettings(Section):
     preset: Annotated[str, setting("1", "sizes, steps, rates: tiny, minute, minutes or gpu", min_length=1)] = "minute"
     effort: Annotated[float, setting("1", "factor on the preset's steps", gt=0)] = 1.0
     levels: Annotated[int, setting("1", "levels of the hash grid; absent: preset", ge=1, le=32)] | None = None
-    features: Annotated[int, setting("1", "numbers a row: 1, 2, 4 or 8; absent: preset", ge=1, le=8)] | None = None
-    log2_table: Annotated[int, setting("1", "logarithm of the most rows a level; absent: preset", ge=8, le=24)] | None = None
-    coarsest: Annotated[int, setting("cell", "cells along the longest edge, first level; absent: preset", ge=1)] | None = None
-    finest: Annotated[int, setting("cell", "cells along the longest edge, last level; absent: preset", ge=1)] | None = None
+    features: Annotated[int, setting("1", "features of a table row: 1, 2, 4 or 8; absent: preset", ge=1, le=8)] | None = None
+    log2_table: Annotated[int, setting("1", "log2 of the most table rows of a level; absent: preset", ge=8, le=24)] | None = (
+        None
+    )
+    coarsest: Annotated[int, setting("cell", "cells along the longest edge, coarsest level; absent: preset", ge=1)] | None = (
+        None
+    )
+    finest: Annotated[int, setting("cell", "cells along the longest edge, finest level; absent: preset", ge=1)] | None = None
     width: Annotated[int, setting("neuron", "neurons of a hidden layer; absent: preset", ge=1, le=256)] | None = None
     samples: Annotated[int, setting("sample", "samples of a step; absent: preset", ge=256, le=1 << 22)] | None = None
-    cells: Annotated[int, setting("cell", "cells of the map of occupied space; absent: preset", ge=4, le=256)] | None = None
+    cells: Annotated[int, setting("cell", "edge of the map of occupied cells; absent: preset", ge=4, le=256)] | None = None
     precision: (
-        Annotated[Literal["single", "half"], setting("1", "floats of the table that rays read; absent: preset")] | None
+        Annotated[Literal["single", "half"], setting("1", "size of the floats in the table that rays read; absent: preset")]
+        | None
     ) = None
 
     def __post_init__(self) -> None:
@@ -204,21 +218,23 @@ class HashExperiment(Section):
 class NerfSettings(Section):
     """The coordinate network and the fit."""
 
-    kind: Annotated[Literal["nerf"], setting("1", "one coordinate network, density and colour of a place and a direction")]
+    kind: Annotated[Literal["nerf"], setting("1", "one network from position and direction to density and colour")]
     preset: Annotated[str, setting("1", "sizes, steps, rates: tiny, minutes or gpu", min_length=1)] = "minutes"
     effort: Annotated[float, setting("1", "factor on the preset's steps", gt=0)] = 1.0
     depth: Annotated[int, setting("layer", "layers of the trunk; absent: preset", ge=1, le=16)] | None = None
-    width: Annotated[int, setting("neuron", "neurons of such a layer; absent: preset", ge=1, le=1024)] | None = None
+    width: Annotated[int, setting("neuron", "neurons of a layer of the trunk; absent: preset", ge=1, le=1024)] | None = None
     skip: (
-        Annotated[int, setting("layer", "layer after which the place is put in again; 0: none; absent: preset", ge=0, le=15)]
+        Annotated[int, setting("layer", "layer after which the position enters again; 0: none; absent: preset", ge=0, le=15)]
         | None
     ) = None
-    place: Annotated[int, setting("1", "frequencies of the place; absent: preset", ge=0, le=16)] | None = None
-    direction: Annotated[int, setting("1", "frequencies of the direction; absent: preset", ge=0, le=16)] | None = None
-    branch: Annotated[int, setting("neuron", "hidden neurons of the colours; absent: preset", ge=1, le=1024)] | None = None
+    place: Annotated[int, setting("1", "frequencies of the encoded position; absent: preset", ge=0, le=16)] | None = None
+    direction: Annotated[int, setting("1", "frequencies of the encoded direction; absent: preset", ge=0, le=16)] | None = None
+    branch: (
+        Annotated[int, setting("neuron", "neurons of the hidden layer for colours; absent: preset", ge=1, le=1024)] | None
+    ) = None
     relu: Annotated[int, setting("1", "1: density by a ReLU, 0: by softplus; absent: preset", ge=0, le=1)] | None = None
     harmonics: (
-        Annotated[int, setting("1", "degree of harmonics for the colours (NeRF-SH); -1: a branch; absent: preset", ge=-1, le=4)]
+        Annotated[int, setting("1", "degree of colour harmonics (NeRF-SH); -1: a branch instead; absent: preset", ge=-1, le=4)]
         | None
     ) = None
     coarse: (
@@ -226,10 +242,13 @@ class NerfSettings(Section):
         | None
     ) = None
     fine: (
-        Annotated[int, setting("sample", "samples where the coarse network has weight; absent: preset", ge=0, le=1024)] | None
+        Annotated[
+            int, setting("sample", "samples of a ray where the coarse network sees matter; absent: preset", ge=0, le=1024)
+        ]
+        | None
     ) = None
     samples: Annotated[int, setting("sample", "samples of a step; absent: preset", ge=256, le=1 << 22)] | None = None
-    cells: Annotated[int, setting("cell", "cells of the map of occupied space; absent: preset", ge=4, le=256)] | None = None
+    cells: Annotated[int, setting("cell", "edge of the map of occupied cells; absent: preset", ge=4, le=256)] | None = None
 
 
 class NerfExperiment(Section):
@@ -262,13 +281,13 @@ class OctreeSettings(Section):
             str,
             setting(
                 "1",
-                "of the grid (tiny, cpu, fine, gpu) or the network at start; absent: cpu, minute (hash) or minutes (nerf)",
+                "preset of the first grid (tiny, cpu, fine, gpu) or network; absent: cpu, minute (hash) or minutes (nerf)",
                 min_length=1,
             ),
         ]
         | None
     ) = None
-    effort: Annotated[float, setting("1", "factor on the steps of octree and grid or network", gt=0)] = 1.0
+    effort: Annotated[float, setting("1", "factor on the steps of the octree and of the first grid or network", gt=0)] = 1.0
     longest: (
         Annotated[int, setting("voxel", "voxels of the grid along its longest edge; absent: preset", ge=8, le=2048)] | None
     ) = None
@@ -277,10 +296,12 @@ class OctreeSettings(Section):
         Annotated[int, setting("1", "levels of the octree below its root; absent: leaves of half a voxel", ge=1, le=12)] | None
     ) = None
     keep_weight: Annotated[
-        float, setting("1", "share of a pixel below which a leaf that weighs less in all views is dropped", ge=0, lt=1)
+        float, setting("1", "a leaf with a smaller weight in every pixel of all views is dropped", ge=0, lt=1)
     ] = 0.015
-    tolerance: Annotated[float, setting("1", "change of views up to which eight leaves become one", ge=0, lt=1)] = 0.15
-    steps: Annotated[int, setting("step", "steps of the octree, before effort", ge=1)] = 400
+    tolerance: Annotated[float, setting("1", "eight leaves become one if no pixel changes by more than this", ge=0, lt=1)] = (
+        0.15
+    )
+    steps: Annotated[int, setting("step", "steps of the fit of the leaves, before effort", ge=1)] = 400
 
 
 class OctreeExperiment(Section):
@@ -305,21 +326,19 @@ class GaussianSettings(Section):
     )
     effort: Annotated[float, setting("1", "factor on the preset's steps", gt=0)] = 1.0
     minutes: (
-        Annotated[float, setting("min", "as many steps as take about this time on two idle cores; no clock is read", gt=0)]
-        | None
+        Annotated[float, setting("min", "time on two idle cores that sets the number of steps; no clock is read", gt=0)] | None
     ) = None
-    start: Annotated[int, setting("1", "first Gaussians without known points; absent: preset", ge=4)] | None = None
-    most: Annotated[int, setting("1", "Gaussians at the end of growth; absent: preset", ge=4)] | None = None
+    start: Annotated[int, setting("1", "number of first Gaussians if no points are known; absent: preset", ge=4)] | None = None
+    most: Annotated[int, setting("1", "largest number of Gaussians; absent: preset", ge=4)] | None = None
     degree: Annotated[int, setting("1", "degree of the spherical harmonics; absent: preset", ge=0, le=3)] | None = None
     control: Annotated[str | None, setting("1", "density control: clone_split or relocation; absent: preset")] = None
     ssim: Annotated[float, setting("1", "weight of SSIM in the loss; absent: preset", ge=0, le=1)] | None = None
-    mip: Annotated[bool, setting("1", "keep the light of Gaussians smaller than a pixel, for other sizes")] = False
+    mip: Annotated[bool, setting("1", "anti-aliasing filter, for images of other sizes than the photographs")] = False
     exposure: (
-        Annotated[bool, setting("1", "gains of each photograph without alpha; absent: if common points differ in exposure")]
-        | None
+        Annotated[bool, setting("1", "fit gains of each photograph without alpha; absent: if exposures differ")] | None
     ) = None
     poses: Annotated[bool, setting("1", "cameras move with the fit, for poses that are off by a pixel or more")] = False
-    views: Annotated[int, setting("1", "photographs of a step, which workers of a cluster share; fewer steps then", ge=1)] = 1
+    views: Annotated[int, setting("1", "photographs in a step; more photographs mean fewer steps", ge=1)] = 1
 
     def __post_init__(self) -> None:
         if self.minutes is not None and self.effort != 1:

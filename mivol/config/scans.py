@@ -44,8 +44,9 @@ class Detector(Section, tag_field="beam"):
         tuple[Literal["shift", "axis", "tilt"], ...],
         setting(
             "1",
-            "geometry as unknowns of the fit; shift: displacement and turn of the detector in each view; axis: the axis along "
-            "the columns; tilt: the axis along and across the light; held-out views decide whether the result is used",
+            "geometry to fit with the volume; shift: displacement and turn of the detector in each view; axis: position of the "
+            "axis along the columns; tilt: lean of the axis along and across the light; held-out views decide whether the "
+            "result is used",
         ),
     ] = ()
 
@@ -135,36 +136,38 @@ class Readings(Section):
             int,
             setting(
                 "pixel",
-                "columns of air at each edge, by which the views are divided; 0: none; absent: mivol looks for air, and uses "
-                "it if its brightness differs from the flats",
+                "columns at each edge that show air; views are divided by their mean; 0: no division; absent: mivol looks "
+                "for air, and divides if its brightness differs from the flats",
                 ge=0,
             ),
         ]
         | None
     ) = None
-    drift: Annotated[int, setting("iteration", "fits of a drift of the light to each pixel; 0: none", ge=0)] = 0
+    drift: Annotated[
+        int, setting("iteration", "times that an offset and a slope over time are fitted to each pixel; 0: never", ge=0)
+    ] = 0
     zingers: Annotated[
         float, setting("1", "pixels this many deviations brighter or darker than their neighbours are not used; 0: off", ge=0)
     ] = 0.0
     phase: Annotated[Phase | None, setting("1", "Paganin's filter, for a single material near the detector")] = None
     hardening: Annotated[
-        int, setting("1", "degree of a polynomial that straightens line integrals of a single material; 0: off", ge=0, le=5)
+        int, setting("1", "degree of the polynomial that corrects beam hardening in a single material; 0: off", ge=0, le=5)
     ] = 0
     scatter: Annotated[
         bool,
         setting(
             "1",
-            "subtract scattered light: a smooth term of the light that makes all views agree; with data.hardening a constant "
-            "behind a single material",
+            "subtract scattered light: a smooth image, the same for all views, by which the views agree; with data.hardening "
+            "a constant behind an object of a single material",
         ),
     ] = False
     rings: Annotated[
         Literal["none", "gain", "sort", "fit"],
         setting(
             "1",
-            "steps between columns to remove, which make rings; gain: a constant factor of each pixel; fit: gain, and what is "
-            "left as unknowns beside the volume; sort: the sorted values of each pixel, for factors that change with the "
-            "brightness; blurs the projections",
+            "ring removal; gain: removes a constant factor of each pixel; fit: as gain, then fits the rest of each pixel with "
+            "the volume; sort: replaces sorted values of each pixel by a median, for factors that change with the "
+            "brightness, and blurs the projections",
         ),
     ] = "none"
     ring_width: (
@@ -172,7 +175,7 @@ class Readings(Section):
             int,
             setting(
                 "pixel",
-                "gain, fit: period along the detector of which half is removed, more of a shorter one; sort: columns of the "
+                "gain, fit: longest period along the detector that is removed (this period by half); sort: columns of the "
                 "median, an odd number; absent: gain 14, fit 5, sort 7",
                 ge=3,
             ),
@@ -182,7 +185,7 @@ class Readings(Section):
     saturation: Annotated[float, setting("reading", "readings from this value on are saturated and not used", gt=0)] = INFINITY
 
 
-FirstRow = Annotated[Literal["lowest", "highest"], setting("1", "row of the detector that the file has first")]
+FirstRow = Annotated[Literal["lowest", "highest"], setting("1", "which row of the detector comes first in the file")]
 
 
 class Measured(Readings, kw_only=True, tag_field="source", tag="measured"):
@@ -193,12 +196,15 @@ class Measured(Readings, kw_only=True, tag_field="source", tag="measured"):
         str,
         setting("1", "entry with image_key, or group with data, data_white, data_dark; empty: the first entry, else exchange"),
     ] = ""
-    data: Annotated[str, setting("1", "dataset (views, rows, columns); empty: the layout's; a name: only named datasets")] = ""
-    flats: Annotated[str, setting("1", "dataset of light without object: name, or other.h5:name; empty: the layout's")] = ""
+    data: Annotated[
+        str, setting("1", "dataset (views, rows, columns); empty: by the layout; if named, name the others too")
+    ] = ""
+    flats: Annotated[str, setting("1", "dataset of light without object: name, or other.h5:name; empty: by the layout")] = ""
     darks: Annotated[str, setting("1", "dataset without light, as flats")] = ""
-    angles: Annotated[str, setting("1", "dataset with one angle per view, as flats; empty and none: evenly over scan.arc")] = ""
+    angles: Annotated[str, setting("1", "dataset with one angle per view, as flats; none found: evenly over scan.arc")] = ""
     angle_unit: Annotated[
-        Literal["degree", "radian"] | None, setting("1", "unit of the angles; absent: their attribute units, else by the arc")
+        Literal["degree", "radian"] | None,
+        setting("1", "unit of the angles; absent: by their attribute units, else by their range"),
     ] = None
     rows: Annotated[
         tuple[Annotated[int, msgspec.Meta(ge=0)], Count] | None,
@@ -281,13 +287,15 @@ class SolveSettings(Section):
     window: Annotated[str, setting("1", "window of fbp and fdk: ram-lak, shepp-logan, cosine, hamming, hann", min_length=1)] = (
         "ram-lak"
     )
-    cutoff: Annotated[float, setting("1", "end of the window, over the Nyquist frequency", gt=0, le=1)] = 1.0
+    cutoff: Annotated[float, setting("1", "highest frequency of the window, over the Nyquist frequency", gt=0, le=1)] = 1.0
     supersampling: (
-        Annotated[int, setting("1", "unknowns along each edge of a voxel, which is their mean; absent: auto 2, others 1", ge=1)]
+        Annotated[
+            int, setting("1", "unknowns along each edge of a voxel; the voxel is their mean; absent: auto 2, others 1", ge=1)
+        ]
         | None
     ) = None
     tv: Annotated[float, setting("tv_unit", "strength of total variation; absent: auto 1, others 0", ge=0)] | None = None
-    delta: Annotated[float, setting("tv_unit", "slope below which noise is smoothed", gt=0)] = 0.1
+    delta: Annotated[float, setting("tv_unit", "slopes below this value are smoothed quadratically", gt=0)] = 0.1
     tv_unit: Annotated[
         Literal["length", "noise"],
         setting(
@@ -304,7 +312,7 @@ class SolveSettings(Section):
             "product; auto: matrix if it fits the memory and saves time",
         ),
     ] = "auto"
-    memory: Annotated[float, setting("GiB", "most memory of stored rows", gt=0)] = 1.0
+    memory: Annotated[float, setting("GiB", "most memory for the stored matrix", gt=0)] = 1.0
     discrepancy: Annotated[float, setting("1", "stop when the residual is this multiple of the noise; 0: never", ge=0)] = 0.0
 
     def __post_init__(self) -> None:

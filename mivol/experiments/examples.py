@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mivol import config
+from mivol.display import to_toml
 from mivol.errors import MivolError
 from mivol.experiments.fit_kind import NullProgress, Progress, RunContext
 from mivol.experiments.kinds import run_experiment
@@ -56,7 +57,7 @@ class StandIn:
 
     def make(self, folder: Path) -> list[str]:
         """Write the volume to a folder; return the settings with its path."""
-        return [f"{self.setting}={to_toml_string(self.write(folder))}"]
+        return [f"{self.setting}={to_toml(str(self.write(folder)))}"]
 
     def write(self, folder: Path) -> Path:
         """Write the volume to a folder; return its path."""
@@ -265,13 +266,13 @@ def prepare(name: str, example: Example, source: Path, folder: Path, progress: P
         if not (photographs / "transforms.json").exists():
             progress.say(["making the photographs"])
             run_script(source / example.photographs, ["-o", str(photographs)])
-        return [f"photos.path={to_toml_string(photographs)}"]
+        return [f"photos.path={to_toml(str(photographs))}"]
     if example.scan:
         readings = folder.resolve() / "scan"
         if not (readings / "truth.npz").exists():
             progress.say(["making the readings"])
             run_script(source / example.scan, ["-o", str(readings)])
-        return [f"{setting}={to_toml_string(readings / file)}" for setting, file in SCAN_FILES.items()]
+        return [f"{setting}={to_toml(str(readings / file))}" for setting, file in SCAN_FILES.items()]
     if example.stand_in is None or find_local_file(example.stand_in.data) is not None:
         return []
     stand_in = example.stand_in
@@ -279,11 +280,6 @@ def prepare(name: str, example: Example, source: Path, folder: Path, progress: P
         f'the public data set "{stand_in.data}" is not on this machine: {stand_in.says} (get it: mivol fetch {stand_in.data})'
     ])  # fmt: skip
     return stand_in.make(folder)
-
-
-def to_toml_string(path: Path) -> str:
-    """A path as a literal TOML string, with backslashes unchanged."""
-    return f"'{path}'"
 
 
 def run_script(path: Path, arguments: list[str]) -> None:

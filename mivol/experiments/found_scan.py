@@ -9,7 +9,6 @@ pixel, in pixels otherwise.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Callable, Sequence
@@ -20,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mivol import config
+from mivol.display import to_toml
 from mivol.errors import MivolError
 from mivol.files.dicom_views import DicomViews, has_views, read_views, survey_views
 from mivol.files.formats import HEAD, read_volume
@@ -67,9 +67,9 @@ class ScanDraft(NamedTuple):
     def toml(self) -> str:
         """The settings as the text of a TOML file."""
         tables = {key: value for key, value in self.raw.items() if isinstance(value, dict)}
-        lines = [f"{key} = {_value(value)}" for key, value in self.raw.items() if key not in tables]
+        lines = [f"{key} = {to_toml(value)}" for key, value in self.raw.items() if key not in tables]
         for name, table in tables.items():
-            lines += ["", f"[{name}]", *(f"{key} = {_value(value)}" for key, value in table.items())]
+            lines += ["", f"[{name}]", *(f"{key} = {to_toml(value)}" for key, value in table.items())]
         return "\n".join(lines)
 
 
@@ -128,13 +128,6 @@ def _merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
         both = isinstance(value, dict) and isinstance(base.get(key), dict)
         merged[key] = base[key] | value if both else value
     return merged
-
-
-def _value(value: Any) -> str:
-    """A value of TOML: texts, numbers, truth values and lists are written as in JSON."""
-    if isinstance(value, float):
-        return repr(value) if math.isfinite(value) else str(value)
-    return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)
 
 
 # -- HDF5 ------------------------------------------------------------------------------------------------------------------

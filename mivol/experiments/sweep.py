@@ -24,6 +24,7 @@ from typing import Any
 import msgspec
 
 from mivol import config
+from mivol.display import to_toml
 from mivol.errors import MivolError
 from mivol.experiments.fit_kind import NullProgress, Progress, RunContext
 from mivol.experiments.kinds import run_experiment
@@ -161,7 +162,7 @@ def plan_sweep(path: Path, over: Sequence[str], changes: Sequence[str], folder: 
     first = config.load(path, changes)
     for combination in itertools.product(*values.values()):
         chosen = dict(zip(values, combination, strict=True))
-        settings = config.load(path, [*changes, *(f"{key}={_to_toml(value)}" for key, value in chosen.items())])
+        settings = config.load(path, [*changes, *(f"{key}={to_toml(value)}" for key, value in chosen.items())])
         flat = config.flatten_settings(config.resolved(settings))
         digest = hashlib.sha256(msgspec.json.encode(flat, order="sorted")).hexdigest()
         name = run_name(chosen)
@@ -169,11 +170,6 @@ def plan_sweep(path: Path, over: Sequence[str], changes: Sequence[str], folder: 
         names.add(name)
     output = Path(f"{first.output.rstrip('/')}_sweep") if folder is None else folder
     return Sweep(first.title, path.parent, output, tuple(values), tuple(runs), command)
-
-
-def _to_toml(value: Any) -> str:
-    """A value as TOML, for :func:`mivol.config.load`."""
-    return json.dumps(value) if isinstance(value, str | bool | list) else repr(value)
 
 
 def run_name(values: dict[str, Any]) -> str:

@@ -77,7 +77,7 @@ class FirstOrder(Optimizer, tag="first order"):
     """Settings of a minimisation along gradients, optionally of a few views per iteration."""
 
     views: Annotated[
-        int, setting("view", "views per iteration, drawn without replacement; 0 leaves it to the problem", ge=0)
+        int, setting("view", "views per iteration, drawn without replacement; 0: all of a scene, or as the preset says", ge=0)
     ] = 0
 
 

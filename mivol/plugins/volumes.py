@@ -281,9 +281,9 @@ class ExtinctionVolume(mi.Volume):
 
 
 class GaussianVolume(ExtinctionVolume):
-    """``<volume type="mivol_gaussians">``: Gaussians for ray tracing: as a medium's ``emission`` they show their colours, as
-    its
-    ``sigma_t`` they are lit.
+    """``<volume type="mivol_gaussians">``: Gaussians for ray tracing.
+
+    As the ``emission`` of a medium they show their colours; as its ``sigma_t`` they are lit.
 
     Parameters:
         filename: Gaussians (.ply, .spz, .splat, .ksplat), or

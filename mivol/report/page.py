@@ -11,7 +11,6 @@ again every few seconds. The views of a reference on a cluster have the same pag
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import statistics
@@ -28,6 +27,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mivol.cite import list_citations
+from mivol.display import to_toml
 from mivol.errors import MivolError
 from mivol.files import write_whole_text
 from mivol.report import figures
@@ -237,19 +237,11 @@ def _duration(seconds: float) -> str:
 def _toml(config: dict[str, Any], prefix: str = "") -> str:
     """The settings as TOML: plain values first, then a table for each group, without unset values."""
     config = {key: value for key, value in config.items() if value is not None}
-    plain = [f"{key} = {_value(value)}" for key, value in config.items() if not isinstance(value, dict)]
+    plain = [f"{key} = {to_toml(value)}" for key, value in config.items() if not isinstance(value, dict)]
     parts = ["\n".join(([f"[{prefix}]"] if prefix and plain else []) + plain)] if plain else []
     tables = {key: value for key, value in config.items() if isinstance(value, dict)}
     parts += [_toml(value, f"{prefix}.{key}" if prefix else key) for key, value in tables.items()]
     return "\n\n".join(part for part in parts if part)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, list) and any(isinstance(item, dict) for item in value):
-        return "[" + ", ".join(_value(item) for item in value) + "]"
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key} = {_value(item)}" for key, item in value.items() if item is not None) + " }"
-    return json.dumps(value, ensure_ascii=False)
 
 
 # -- The page of a sweep -----------------------------------------------------------------------------------------------

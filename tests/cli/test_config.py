@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import re
 import tomllib
 from pathlib import Path
 
@@ -53,7 +54,7 @@ def test_every_setting_says_what_it_is() -> None:
     lines = describe(config.SceneExperiment)
     assert any(line.startswith("optimizer[adam].beta_1 = 0.9: ") for line in lines)
     assert any(line.startswith("fit.spp = 16 [sample/pixel]: ") for line in lines)
-    assert any(line.startswith("parameter.0.prior.0[tv].weight = 1.0: ") for line in lines)
+    assert any(line.startswith("parameter.0.prior.0[tv,huber_tv,laplacian,l1,bounds].weight = 1.0: ") for line in lines)
     assert all(line.partition(": ")[2].strip() for line in lines)
 
 
@@ -197,6 +198,18 @@ def test_settings_say_what_they_are_chosen_from() -> None:
     assert "(turntable | views | keyframes)" in next(
         line for line in describe(config.FieldExperiment) if line.startswith("show.way")
     )
+
+
+def test_a_setting_of_several_choices_is_said_once() -> None:
+    """The distances of ring and hemisphere are equal; the default counts are not."""
+    lines = describe(config.SceneExperiment)
+    starts = [line.split(":")[0] for line in lines if line.startswith("views[") and re.search(r"\.(distance|count) ", line)]
+    assert starts[:3] == [
+        "views[ring].count = 8",
+        "views[ring,hemisphere].distance = 4.0 [radius of the box]",
+        "views[hemisphere].count = 16",
+    ]
+    assert "fit.max_depth = absent" in {line.split(":")[0] for line in lines}
 
 
 @pytest.mark.parametrize(

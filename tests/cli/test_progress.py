@@ -39,7 +39,7 @@ def fit_at(done: int, loss: float, measures: int = 0, log: tuple[str, ...] = ())
 
 
 def test_the_newest_numbers_in_words() -> None:
-    assert progress.figures(fit_at(1, 0.123456)) == "loss 0.1235, PSNR of the fitted views 20.12, mine 0.5"
+    assert progress.figures(fit_at(1, 0.123456)) == "loss 0.1235, PSNR of the fitted views 20.12 dB, mine 0.5"
 
 
 def test_channels_of_a_parameter_are_one_group() -> None:
@@ -73,7 +73,7 @@ def test_a_fit_is_watched(output: tuple) -> None:
     """On a terminal the bar is drawn anew at most ten times a second; elsewhere a line a measure. What the fit logs is said
     once. In the end the last numbers stand there."""
     written, is_terminal, clock = output
-    figures = "loss 0.5, PSNR of the fitted views 20.12, mine 0.5"
+    figures = "loss 0.5, PSNR of the fitted views 20.12 dB, mine 0.5"
     with progress.TerminalProgress().watch(8) as display:
         seen = []
         for done, later, measures in ((1, 0.2, 1), (2, 0.05, 1), (3, 0.06, 2), (4, 0, 2)):
