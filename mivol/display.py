@@ -46,6 +46,15 @@ def format_point(values: Iterable[float]) -> str:
     return f"({', '.join(f'{value:.4g}' for value in values)})"
 
 
+def format_duration(seconds: float) -> str:
+    """Write a time with its unit: ``350 ms``, ``2.5 s``, ``90 s``, ``5.0 min``, ``2.5 h``."""
+    if seconds < 0.95:
+        return f"{1000 * seconds:.0f} ms"
+    if seconds < 120:
+        return f"{seconds:.{int(seconds < 9.95)}f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+
+
 def to_toml(value: object) -> str:
     """Write a value of a setting as TOML does: lists and tables on one line, entries of None left out."""
     if isinstance(value, Mapping):

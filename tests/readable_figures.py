@@ -45,7 +45,8 @@ def _texts(figure: Figure) -> list[Text]:
     found = [*figure.texts, *(text for part in figure.subfigs for text in part.texts)]
     for axes in figure.axes:
         found += [axes.title, axes._left_title, axes._right_title, *axes.texts]
-        found += [axes.xaxis.label, axes.yaxis.label] if axes.axison else []
+        # Axes of a 3D plot draw themselves, though their axison is false.
+        found += [axis.label for axis in axes._axis_map.values()] if axes.axison or axes.name == "3d" else []
         found += axes.get_legend().get_texts() if axes.get_legend() is not None else []
     return [text for text in found if text.get_visible() and text.get_text().strip()]
 

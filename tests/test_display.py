@@ -13,13 +13,14 @@ from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
+import pytest
 from ball_photos import ball, photo
 from fit_scene import KEY
 from PIL import Image
 from tiny_experiment import write_experiment
 
 import mivol
-from mivol.display import curve_html, summarize, to_toml, with_short_repr
+from mivol.display import curve_html, format_duration, summarize, to_toml, with_short_repr
 from mivol.experiments.script import Problem, optimize
 from mivol.files import VolumeData
 from mivol.files.image_files import EDGE, GAP, pairs_html
@@ -44,6 +45,24 @@ def test_values_as_toml_read_back() -> None:
     value = {"domain": (0.0, math.inf), "name": 'C:\\runs\\"näher"', "steps": [{"at": (5, 7), "end": None}], "on": True}
     expected = {"domain": [0.0, math.inf], "name": 'C:\\runs\\"näher"', "steps": [{"at": [5, 7]}], "on": True}
     assert tomllib.loads(f"value = {to_toml(value)}")["value"] == expected
+
+
+DURATIONS = {
+    0.0123: "12 ms",
+    0.94: "940 ms",
+    0.95: "0.9 s",
+    9.94: "9.9 s",
+    9.95: "10 s",
+    119.4: "119 s",
+    120: "2.0 min",
+    7199: "120.0 min",
+    7200: "2.0 h",
+}
+
+
+@pytest.mark.parametrize("seconds", DURATIONS)
+def test_durations_have_a_suitable_unit(seconds: float) -> None:
+    assert format_duration(seconds) == DURATIONS[seconds]
 
 
 def test_values_in_a_few_words() -> None:

@@ -406,8 +406,8 @@ def describe_speed(field: SphericalGrid | Octree, other: SphericalGrid | Octree,
 def describe_leaves(tree: Octree) -> str:
     """Number, sizes and degree of the leaves of an octree."""
     sizes = np.bincount(tree.sizes)
-    edges = ", ".join(f"{2**k} ({n})" for k, n in enumerate(sizes) if n)
-    return f"{tree.leaves} leaves in 2^{tree.depth} cells along an axis, with edges of {edges} cells; degree {tree.degree}"
+    edges = ", ".join(f"{n} of {2**k}" for k, n in enumerate(sizes) if n)
+    return f"{tree.leaves} leaves in {2**tree.depth} cells along each axis; edges [cells]: {edges}; degree {tree.degree}"
 
 
 def describe_field(path: Path, variant: str) -> Explanation:

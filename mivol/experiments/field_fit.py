@@ -18,7 +18,7 @@ from mivol.config import FieldExperiment
 from mivol.errors import MivolError
 from mivol.experiments.fit_kind import Say
 from mivol.experiments.photo_data import LEARNED
-from mivol.experiments.photo_fit import MOTIONS, PhotoFit, describe_free_space
+from mivol.experiments.photo_fit import MOTIONS, PhotoFit, describe_free_space, explain_photos, explain_stop, explain_time
 from mivol.experiments.run_folder import BestFiles, RunFolder
 from mivol.fields.field_files import write_field
 from mivol.fields.sky import Sky
@@ -315,16 +315,11 @@ def can_reduce_levels(plan: RadiancePlan, photos: Photos) -> bool:
     return plan.fewer_levels and points is not None and len(points) >= FEWEST_POINTS
 
 
-SPREAD = "for two idle cores; up to three times as long if matter fills the box"
-"""What the time of steps depends on."""
-
-
 def explain_plan(plan: RadiancePlan, photos: Photos, batches: RayBatches) -> list[PlanLine]:
     """Return the choices of a plan with their reasons."""
     box, origins = photos.box, np.array([view.camera.origin for view in photos.views])
     resolutions = ", ".join(str(stage.longest) for stage in plan.stages)
     width, height = photos.views[0].camera.size
-    size = " x ".join(f"{edge:.4g}" for edge in box[1] - box[0])
     largest = nested_boxes(box, plan.levels)[-1]
     outer = " x ".join(f"{edge:.4g}" for edge in largest[1] - largest[0])
     holds = "no more than points and cameras need; " if can_reduce_levels(plan, photos) else ""
@@ -336,22 +331,22 @@ def explain_plan(plan: RadiancePlan, photos: Photos, batches: RayBatches) -> lis
         )
     ]
     return [
-        PlanLine(choice=f"{len(photos.views)} photographs, a box of {size} [length]", reason=photos.survey.box_from),
+        explain_photos(photos),
         *outer_boxes[: plan.levels > 1],
         *explain_points_outside(plan, photos),
         *explain_depths(plan, batches),
         *explain_near_cameras(plan, origins, box),
         *explain_free_space(plan, photos),
         *explain_wide_lenses(photos),
-        PlanLine(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find empty space"),
+        PlanLine(choice=f"stages: {resolutions} nodes along the longest edge", reason="coarse first, to find empty space"),
         explain_steps(plan),
-        PlanLine(choice=f"about {plan.minutes:.2g} minutes", reason=SPREAD),
+        explain_time(plan.minutes, "up to three times as long if matter fills the box"),
         explain_sizes(plan, (width, height)),
         explain_degree(plan, len(photos.views)),
         explain_background(plan, photos),
         *explain_gains(plan),
         *[MOTIONS][: plan.poses],
-        PlanLine(choice=f"rays end at a transmittance of {plan.stop:g}", reason="largest neglected share of the light"),
+        explain_stop(plan.stop),
         PlanLine(choice=check_memory(plan, box, batches), reason="estimated before the allocation"),
     ]
 
@@ -403,10 +398,10 @@ def explain_degree(plan: RadiancePlan, photographs: int) -> PlanLine:
 def explain_steps(plan: RadiancePlan) -> PlanLine:
     """Return the number of steps of the stages, and the bound on the steps."""
     steps = ", ".join(str(stage.steps) for stage in plan.stages)
-    reason = "field.effort"
+    reason = "the preset's, times field.effort"
     if plan.epochs < math.inf:
         reason += f"; beyond {FEWEST_STEPS} steps, each pixel is used at most {plan.epochs:g} times, to avoid a fit of noise"
-    return PlanLine(choice=f"{steps} steps in these stages", reason=reason)
+    return PlanLine(choice=f"steps of the stages: {steps}", reason=reason)
 
 
 def explain_sizes(plan: RadiancePlan, stored_size: tuple[int, int]) -> PlanLine:
@@ -414,7 +409,7 @@ def explain_sizes(plan: RadiancePlan, stored_size: tuple[int, int]) -> PlanLine:
     width, height = stored_size
     if all(stage.shrink == 1 for stage in plan.stages):
         reason = "their pixels are not much finer than voxels"
-        return PlanLine(choice=f"photographs at {width} x {height} in all stages", reason=reason)
+        return PlanLine(choice=f"photographs at {width} x {height} pixels in all stages", reason=reason)
     return PlanLine(
         choice=f"photographs shrunk by {', '.join(str(stage.shrink) for stage in plan.stages)} in these stages",
         reason=f"voxels of these stages are larger than finer pixels; memory holds the photographs at {width} x {height}",

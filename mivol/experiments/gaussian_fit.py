@@ -23,7 +23,7 @@ from scipy.special import logit
 from mivol.config import GaussianExperiment
 from mivol.errors import MivolError
 from mivol.experiments.fit_kind import Stages
-from mivol.experiments.photo_fit import MOTIONS, PhotoFit, describe_free_space
+from mivol.experiments.photo_fit import MOTIONS, PhotoFit, describe_free_space, explain_photos, explain_time
 from mivol.experiments.run_folder import BestFiles, RunFolder
 from mivol.optim.gaussians.density_control import CloudArrays
 from mivol.optim.gaussians.gaussian_plan import CONTROLS, PRESETS, GaussianPlan, check_memory, scene_extent
@@ -234,8 +234,8 @@ def explain_gains(plan: GaussianPlan, exposures: Exposures | None) -> list[PlanL
     if exposures is None:
         return [GAINS][: plan.exposure]
     facts = (
-        f"common points differ in brightness by {exposures.spread:.0%} between photographs, and by "
-        f"{exposures.unpredicted:.0%} from what the nearest photographs predict"
+        f"points differ in brightness by {exposures.spread:.0%} between photographs, and by {exposures.unpredicted:.0%} from "
+        "the prediction by the nearest photographs"
     )
     return [PlanLine(choice=f"{'' if plan.exposure else 'no '}gains of each photograph", reason=facts)]
 
@@ -261,16 +261,16 @@ def explain_plan(
     }[plan.control]
     views = "one photograph" if plan.views == 1 else f"{plan.views} photographs"
     return [
-        PlanLine(choice=f"{len(photos.views)} photographs", reason=f"their box: {photos.survey.box_from}"),
+        explain_photos(photos),
         PlanLine(choice=f"{count} Gaussians at first", reason=whence),
         PlanLine(choice=f"up to {max(plan.most, count)} Gaussians", reason=control),
         PlanLine(choice=f"{plan.steps} steps: {'; '.join(stages)}", reason=f"small photographs first, {views} a step"),
-        PlanLine(choice=f"a loss with a share of {plan.ssim:g} of SSIM", reason="the rest is the absolute error"),
+        PlanLine(choice=f"loss: {1 - plan.ssim:g} L1 + {plan.ssim:g} (1 - SSIM)", reason="gaussians.ssim, or the preset's"),
         *explain_capture(plan, len(photos.views)),
         background,
         *explain_gains(plan, exposures),
         *[MOTIONS][: plan.poses],
-        PlanLine(choice=f"about {minutes:.2g} minutes", reason="for two idle cores; the number of steps is fixed"),
+        explain_time(minutes),
         PlanLine(choice=memory, reason="estimated before the allocation"),
     ]
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from mivol.config import OctreeExperiment, OctreeSettings, flatten_settings
+from mivol.display import format_duration
 from mivol.errors import MivolError
 from mivol.experiments.field_conversion import describe_leaves, describe_speed
 from mivol.experiments.field_fit import FieldFit, adapt_plan, explain_plan, make_batches, set_background, write_result
@@ -94,12 +95,12 @@ class OctreeFit(FieldFit):
         leaves = self.plan.leaves
         steps = PlanLine(
             choice=f"{leaves.steps} steps of the octree, {describe_size(leaves.shrink)}",
-            reason=f"field.steps times field.effort; the leaves stay in place; about {leaves.minutes:.2g} minutes more",
+            reason=f"field.steps times field.effort; leaves stay in place; about {format_duration(60 * leaves.minutes)} more",
         )
         size = "half a voxel" if not self.plan.recipe.depth else f"a cube's edge over 2^{self.plan.recipe.depth}"
         built = PlanLine(
-            choice=f"leaves of {size} where a view gives a leaf {self.plan.recipe.keep_weight:g} of a pixel",
-            reason=f"field.keep_weight; eight become one if views change by less than {self.plan.recipe.tolerance:g}",
+            choice=f"leaves of {size}, dropped if they weigh below {self.plan.recipe.keep_weight:g} in every pixel",
+            reason=f"field.keep_weight; eight become one if no pixel changes by more than {self.plan.recipe.tolerance:g}",
         )
         if self.plan.grid is None:
             self.steps = SampledFit.steps
@@ -288,8 +289,8 @@ def adapt_octree_plan(plan: OctreePlan, preset: str, photos: Photos) -> tuple[Oc
 
 def tabulate_stages(rows: list[tuple[str, ...]], tree: Octree) -> Table:
     """Table of the finished stages of a run."""
-    head = ("stage", "size", "PSNR of the judged views [dB], from the file", "file [MiB]", "memory [MiB]", "time [s]")
-    return Table(title=f"Stages: {describe_leaves(tree)}", head=head, rows=tuple(rows))
+    head = ("stage", "size", "PSNR of the held-out views, from the file [dB]", "file [MiB]", "memory [MiB]", "time [s]")
+    return Table(title=f"Stages of the octree ({describe_leaves(tree)})", head=head, rows=tuple(rows))
 
 
 def read_start(path: Any, space: str, white: float) -> AnyField:

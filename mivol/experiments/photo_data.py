@@ -168,16 +168,16 @@ def describe_photos(photos: Photos, judged: Photos | None = None) -> list[str]:
             "figures are tone-mapped: the sRGB curve of y, from 0 to 1."
         ]
     else:
-        notes = ["Colours are srgb code values; in a scene, mivol_sh and mivol_gaussians show the decoded radiance."]
+        notes = ["Colours are sRGB values; in a scene, mivol_sh and mivol_gaussians convert them to radiance."]
     if "linear" in photos.stored and photos.space == "srgb":
         notes.append("Photographs of radiance were encoded as sRGB; radiance above 1 counts as 1.")
     if "srgb" in photos.stored and photos.space == "linear":
-        notes.append("Code values were decoded by the sRGB curve.")
+        notes.append("sRGB values of the photographs were converted to radiance.")
     if judged is not None:
         width, height = judged.views[0].camera.size
         notes.append(
-            f"PSNR is the mean over the {len(judged.views)} judged views (the first has {width} x {height} pixels), of 8-bit "
-            "sRGB codes with the peak 1."
+            f"PSNR is the mean over the {len(judged.views)} held-out views (the first has {width} x {height} pixels). It "
+            "compares 8-bit sRGB values; its peak is 1."
         )
     notes += [f"{note[:1].upper()}{note[1:]}." for note in photos.survey.notes]
     if photos.skipped:

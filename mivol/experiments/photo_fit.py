@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mivol.config import PhotoExperiment
+from mivol.display import format_duration
 from mivol.experiments.film import plan_film
 from mivol.experiments.fit_kind import Evaluation, FitKind, RunContext, Say, Stages
 from mivol.experiments.photo_data import add_box, describe_photos, read_photos
@@ -25,7 +26,7 @@ from mivol.optim.events import Checkpoint
 from mivol.optim.loop import Course, Fit
 from mivol.optim.optimizer import Optimizer
 from mivol.optim.photographs.field_view import FieldView
-from mivol.photos import Camera, Photo
+from mivol.photos import Camera, Photo, Photos
 from mivol.photos.camera import align_camera
 from mivol.photos.camera_path import HomeView, find_home_view
 from mivol.photos.photo_file import CONVERSIONS
@@ -51,7 +52,7 @@ def select_shown_views(count: int, shown: int) -> frozenset[int]:
 def describe_quality(quality: ImageScore, fitted: float | None = None) -> str:
     """Caption of a view: metrics, and the PSNR [dB] after colour correction if given."""
     metrics = [format_metric(name, value) for name, value in quality.values.items()]
-    return ", ".join(metrics if fitted is None else [*metrics, f"{fitted:.2f} dB after a fit of the colours"])
+    return ", ".join(metrics if fitted is None else [*metrics, f"{fitted:.2f} dB after colour correction"])
 
 
 def format_metric(metric: str, value: float) -> str:
@@ -171,14 +172,31 @@ def tabulate_views(
     metrics = list(scores[0].values)
     head = ("view", *(METRICS[name].label for name in metrics))
     rows = [(one.name, *(f"{one.values[name]:.{METRICS[name].digits}f}" for name in metrics)) for one in scores]
-    more = {"PSNR [dB], colours fitted to the photograph's": fitted, "PSNR [dB], pose aligned to the photograph": aligned}
+    more = {"PSNR after colour correction [dB]": fitted, "PSNR after alignment of the pose [dB]": aligned}
     for label, values in more.items():
         if values:
             head += (label,)
             rows = [(*row, f"{value:.2f}") for row, value in zip(rows, values, strict=True)]
     rows.sort(key=lambda row: float(row[1]))
     width, height = camera.size
-    return Table(title=f"Judged views, at {width} x {height} pixels, the worst first", head=head, rows=tuple(rows))
+    return Table(title=f"Held-out views, at {width} x {height} pixels, the worst first", head=head, rows=tuple(rows))
+
+
+def explain_photos(photos: Photos) -> PlanLine:
+    """Return the number of photographs and the size of the box, with the origin of the box."""
+    edges = " x ".join(f"{edge:.4g}" for edge in photos.box[1] - photos.box[0])
+    return PlanLine(choice=f"{len(photos.views)} photographs, a box of {edges} [length]", reason=photos.survey.box_from)
+
+
+def explain_time(minutes: float, reason: str = "the number of steps is fixed") -> PlanLine:
+    """Return the time of a fit on the reference machine, and a reason why it may differ."""
+    return PlanLine(choice=f"about {format_duration(60 * minutes)}", reason=f"on two idle cores; {reason}")
+
+
+def explain_stop(transmittance: float) -> PlanLine:
+    """Return the transmittance at which rays end."""
+    reason = "they lose at most this share of the light"
+    return PlanLine(choice=f"rays end at a transmittance of {transmittance:g}", reason=reason)
 
 
 def describe_free_space(cameras: Sequence[Camera], reach: float) -> PlanLine:

@@ -14,6 +14,7 @@ import numpy as np
 from mivol.config import HashExperiment, NerfExperiment
 from mivol.errors import MivolError
 from mivol.experiments.field_fit import FieldFit, explain_wide_lenses, write_result
+from mivol.experiments.photo_fit import explain_photos, explain_stop, explain_time
 from mivol.experiments.run_folder import RunFolder
 from mivol.fields.hash_grid import HashField
 from mivol.fields.sampled_field import SampledField
@@ -125,29 +126,26 @@ def explain_sampled_plan(plan: SampledPlan, photos: Photos, batches: RayBatches)
         MivolError: more memory than available.
     """
     box = photos.box
-    edges = " x ".join(f"{edge:.4g}" for edge in box[1] - box[0])
     model, numbers = plan.sizes.describe(box[1] - box[0])
     behind = "alpha marks the object" if photos.views[0].alpha is not None else "photos.background"
     most = plan.cells * plan.samples_a_cell
-    spacing = f"{plan.samples_a_cell:g} along a cell of the map of occupied space, {plan.cells} cells an edge"
+    spacing = f"{plan.samples_a_cell:g} along a cell of the map of occupied cells, with {plan.cells} cells an edge"
     why = f"{spacing}; the number of rays grows as the map empties"
     if first := getattr(plan.sizes, "coarse", 0):
         most = 2 * first + plan.sizes.fine
-        why = (
-            f"{first} by the coarse network, and by the other at these and at {plan.sizes.fine} more: field.coarse, field.fine"
-        )
+        why = f"the coarse network takes {first}, the fine one these and {plan.sizes.fine} more (field.coarse, field.fine)"
     return [
-        PlanLine(choice=f"{len(photos.views)} photographs, a box of {edges} [length]", reason=photos.survey.box_from),
+        explain_photos(photos),
         PlanLine(choice=model, reason=numbers),
         *explain_table(plan, box),
         PlanLine(
             choice=f"{plan.samples} samples a step, about {most:.0f} a ray at first",
             reason=why,
         ),
-        PlanLine(choice=f"{plan.steps} steps", reason="field.effort"),
-        PlanLine(choice=f"about {plan.minutes:.2g} minutes", reason="for two idle cores; the number of steps is fixed"),
+        PlanLine(choice=f"{plan.steps} steps", reason="the preset's, times field.effort"),
+        explain_time(plan.minutes),
         PlanLine(choice="no field behind the box", reason=behind),
         *explain_wide_lenses(photos),
-        PlanLine(choice=f"rays end at a transmittance of {plan.stop:g}", reason="largest neglected share of the light"),
+        explain_stop(plan.stop),
         PlanLine(choice=check_memory(plan, box, batches), reason="estimated before the allocation"),
     ]

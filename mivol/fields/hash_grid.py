@@ -115,10 +115,10 @@ class HashField(SampledField):
 
     def tabulate(self) -> tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]:
         rows = [
-            (str(k), " x ".join(map(str, level.cells)), str(level.rows), "each node" if level.is_dense else "hashed")
+            (str(k), " x ".join(map(str, level.cells)), str(level.rows), "its own" if level.is_dense else "by a hash")
             for k, level in enumerate(self.encoding.levels)
         ]
-        return ("level", "cells", "rows", "nodes"), tuple(rows)
+        return ("level", "cells", "rows", "row of a node"), tuple(rows)
 
     @property
     def scale(self) -> float:

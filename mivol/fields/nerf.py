@@ -139,7 +139,7 @@ class NerfSizes:
 
     def describe(self, edges: np.ndarray) -> tuple[str, str]:
         """Layers, and their numbers."""
-        joined = f", the place again after layer {self.skip}" if self.skip else ""
+        joined = f", the position again after layer {self.skip}" if self.skip else ""
         seen = f"{self.direction} of the direction"
         head = f"{self.branch} neurons for the colours"
         if self.harmonics >= 0:
@@ -148,7 +148,7 @@ class NerfSizes:
         number = "a network" if self.networks == 1 else "two networks"
         return (
             f"{number} of {self.depth} layers x {self.width}{joined}, {head}{rounds}",
-            f"{self.networks * self.size} weights; {self.place} frequencies of the place, {seen}",
+            f"{self.networks * self.size} weights; {self.place} frequencies of the position, {seen}",
         )
 
 

@@ -115,7 +115,7 @@ class PhotoSurvey:
             f"{self.path}: {self.format}, {len(cameras)} photographs ({counts}), {', '.join(sizes)} pixels, {lens}",
             f"focal length {_format_range(focal)} pixels, horizontal field of view {angle} degrees",
             f"box {format_point(self.box[0])} to {format_point(self.box[1])}, {self.box_from}",
-            f"near {self.near_far[0]:.4g}, far {self.near_far[1]:.4g} from the cameras",
+            f"distances from the cameras: {self.near_far[0]:.4g} (near) to {self.near_far[1]:.4g} (far)",
         ]
         if self.skipped:
             lines.append(f"skipped {len(self.skipped)} missing photographs: {name_first(self.skipped)}")

@@ -13,6 +13,7 @@ from __future__ import annotations
 import base64
 import html
 import itertools
+import math
 import shlex
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -59,9 +60,11 @@ WIDTH = 4.8
 
 
 ZOOM = 0.88
-"""Size of the side view in its panel, which leaves room for the label of the up axis."""
+"""Longest edge of the side view over that of a cube which fills the panel; leaves room for the label of the up axis."""
 
-LABELS = {"train": "training view", "held_out": "held-out view", "val": "validation view", "test": "test view"}
+FITTED, HELD_OUT = "fitted view", "held-out view"
+
+LABELS = {"train": FITTED, "held_out": HELD_OUT, "val": "validation view", "test": "test view"}
 """Split -> label in the legend."""
 
 
@@ -236,7 +239,9 @@ def _draw_side(axes: Axes, arranged: Arrangement) -> None:
     # With up along a negative axis, both the upright and a horizontal axis are reversed, which is a half turn and no mirror.
     turned = (lambda k: (high[k], low[k])) if arranged.is_down else (lambda k: (low[k], high[k]))
     axes.set(xlim=(low[0], high[0]), ylim=turned(1), zlim=turned(2))
-    axes.set_box_aspect(high - low, zoom=ZOOM)
+    # Matplotlib fixes the diagonal of the plot: a flat plot is wider than a cube, and its labels leave the figure.
+    edges = (high - low) / (high - low).max()
+    axes.set_box_aspect(edges, zoom=ZOOM * np.linalg.norm(edges) / math.sqrt(3))
     for k, (name, axis) in enumerate(zip(order, (axes.xaxis, axes.yaxis, axes.zaxis), strict=True)):
         axis.set_label_text(f"{'xyz'[name]} [length]")
         axis.set_major_locator(MaxNLocator(4 if high[k] - low[k] > LOW * (high - low).max() else 1, min_n_ticks=1))
@@ -288,7 +293,7 @@ BEAM_REACH = 1.5
 MARKER_WIDTH = 0.2
 """Half the width of a marker of parallel light divided by its length."""
 
-FITTED, HELD_OUT, DETECTOR, FIRST = "fitted view", "held-out view", "detector of some views", "beam of the first view"
+DETECTOR, FIRST = "detector of some views", "beam of the first view"
 
 
 class Beams(NamedTuple):

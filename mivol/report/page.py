@@ -27,7 +27,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mivol.cite import list_citations
-from mivol.display import to_toml
+from mivol.display import format_duration, to_toml
 from mivol.errors import MivolError
 from mivol.files import write_whole_text
 from mivol.report import figures
@@ -116,7 +116,7 @@ def headline(record: RunRecord, held_out_psnr: Sequence[float] = ()) -> str:
         errors.append(f"a volume nRMSE of {record.results['nrmse']:.3g}")
     cores = f"{record.machine.cores} core" + ("s" if record.machine.cores != 1 else "")
     seconds = _total_seconds(record)
-    verdict = f"{VERDICTS[record.status]} {_duration(seconds)}" if seconds else VERDICTS[record.status].rpartition(" ")[0]
+    verdict = f"{VERDICTS[record.status]} {format_duration(seconds)}" if seconds else VERDICTS[record.status].rpartition(" ")[0]
     return f"{verdict} on {cores}" + (": " + ", ".join(errors) if errors else "") + "."
 
 
@@ -136,7 +136,7 @@ def _environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(duration=_duration, times=_format_shape, unbroken=_unbroken)
+    environment.filters.update(duration=format_duration, times=_format_shape, unbroken=_unbroken)
     return environment
 
 
@@ -176,7 +176,7 @@ def _numbers(record: RunRecord, views: Sequence[ViewRow], volumes: Sequence[Volu
         judged = f": {record.judged}" if record.judged else ""
         tiles.append((f"{np.mean(held_out):.1f}", "dB", f"PSNR, held-out views{spread}{judged}"))
     if seconds:
-        tiles.append((*_duration(seconds).split(" "), "total time"))
+        tiles.append((*format_duration(seconds).split(" "), "total time"))
     tiles += join_channels(
         _result_tile(name, value, record.units) for name, value in record.results.items() if name not in leading
     )
@@ -222,18 +222,6 @@ def _format_shape(shape: Sequence[int]) -> str:
     return " × ".join(map(str, shape))
 
 
-def _duration(seconds: float) -> str:
-    if seconds < 0.95:
-        return f"{1000 * seconds:.0f} ms"
-    if seconds < 9.95:
-        return f"{seconds:.1f} s"
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    if seconds < 7200:
-        return f"{seconds / 60:.1f} min"
-    return f"{seconds / 3600:.1f} h"
-
-
 def _toml(config: dict[str, Any], prefix: str = "") -> str:
     """The settings as TOML: plain values first, then a table for each group, without unset values."""
     config = {key: value for key, value in config.items() if value is not None}
@@ -250,6 +238,9 @@ SWEEP_PAGE = "sweep.html"
 
 NOT_DRAWN = ("iterations", "views")
 """Results that are settings or counts."""
+
+CLOSEST_TICKS = 1 / 8
+"""Smallest distance of swept values that are all written at a linear axis, over the length of the axis."""
 
 
 @dataclass(frozen=True)
@@ -370,6 +361,7 @@ def plot_points(points: dict[float, list[float]], key: str, title: str) -> Figur
         axes.set_xlabel(key)
         if min(x) > 0 and max(x) / min(x) >= 8:
             axes.set_xscale("log", base=2)
+        if axes.get_xscale() == "log" or min(np.diff(x)) >= CLOSEST_TICKS * (x[-1] - x[0]):
             axes.set_xticks(x, [f"{value:g}" for value in x])
         axes.margins(x=0.03, y=0.12)
     return figure

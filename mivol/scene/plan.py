@@ -244,7 +244,11 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     pass_rays = _rays_per_pass(needs)
     passes = -(-needs.crop_samples // pass_rays)
     choices.append(
-        Choice("passes", f"{passes} of at most {pass_rays} rays", f"{needs.crop_samples} samples; a pass ends within seconds")
+        Choice(
+            "passes",
+            f"{passes}, of at most {pass_rays:,} rays each",
+            f"{needs.crop_samples:,} samples; a pass ends within seconds",
+        )
     )
     memory, choice = _plan_gradient_memory(needs)
     choices.append(choice)

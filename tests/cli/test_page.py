@@ -271,24 +271,6 @@ def test_counts_have_si_prefixes(number):
     assert page_module._count(number) == COUNTS[number]
 
 
-DURATIONS = {
-    0.0123: "12 ms",
-    0.94: "940 ms",
-    0.95: "0.9 s",
-    9.94: "9.9 s",
-    9.95: "10 s",
-    119.4: "119 s",
-    120: "2.0 min",
-    7199: "120.0 min",
-    7200: "2.0 h",
-}
-
-
-@pytest.mark.parametrize("seconds", DURATIONS)
-def test_durations_have_a_suitable_unit(seconds):
-    assert page_module._duration(seconds) == DURATIONS[seconds]
-
-
 def test_a_broken_render_has_no_psnr(tmp_path):
     render = np.ones((4, 6))
     render[1, 2] = np.nan
@@ -645,3 +627,15 @@ def test_every_part_of_a_record_is_on_the_page(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("value", "said"), [(None, "–"), (12345.0, "12,345"), (0.123456, "0.123")])
 def test_whole_results_have_all_digits_and_others_three(value: float | None, said: str) -> None:
     assert page_module._result_tile("iterations", value, {})[0] == said
+
+
+@pytest.mark.parametrize(
+    ("values", "ticks"),
+    [((2, 4), ["2", "4"]), ((0, 1, 100), None), ((1, 4, 16), ["1", "4", "16"])],
+    ids=["few values", "values that lie close", "a logarithmic axis"],
+)
+def test_swept_values_stand_at_the_axis(values: tuple[float, ...], ticks: list[str] | None) -> None:
+    """A sweep over 2 and 4 samples has no mark at 2.25; labels of 0 and 1 beside 100 would overlap."""
+    (axes,) = page_module.plot_points({value: [1.0, 2.0] for value in values}, "fit.spp", "Loss").axes
+    labels = [label.get_text() for label in axes.get_xticklabels()]
+    assert labels == ticks if ticks else len(labels) > 3

@@ -33,7 +33,7 @@ def test_explain_says_what_there_is_and_draws_it(tmp_path: Path, capsys: pytest.
     picture = tmp_path / "cameras.png"
     assert main(["explain", str(folder), "-o", str(picture)]) == 0
     said = capsys.readouterr().out
-    facts = ("Blender (NeRF)", "5 photographs (3 train, 2 test)", "12 x 8 pixels", "focal length 14.19", "box (", "near ")
+    facts = ("Blender (NeRF)", "5 photographs (3 train, 2 test)", "12 x 8 pixels", "focal length 14.19", "box (", "(near)")
     for fact in (*facts, "skipped 1 missing photographs: ./train/r_1", str(picture)):
         assert fact in said
     with Image.open(picture) as image:
@@ -155,7 +155,7 @@ def test_picture_shows_all_splits(tmp_path: Path, artefacts: Path) -> None:
     survey = survey_photos(write_blender(tmp_path / "set"), held_out=2)
     figure = plot_cameras(survey, artefacts / "cameras.png")
     labels = [text.get_text() for text in figure.axes[1].get_legend().get_texts()]
-    assert labels == ["training view", "held-out view", "test view", "box"]
+    assert labels == ["fitted view", "held-out view", "test view", "box"]
 
 
 def test_reference_of_all_sensors_is_a_data_set(variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -127,7 +127,7 @@ def test_a_plan_holds_what_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     assert made.occupied == math.ceil(8 * (plan.MAX_SKIPPED_SHARE - 1e-9)) / 8
     passes = math.ceil((2**24 + 1) / made.pass_rays)
     said = {choice.subject: choice.choice for choice in made.choices}
-    assert said["passes"] == f"{passes} of at most {made.pass_rays} rays"
+    assert said["passes"] == f"{passes}, of at most {made.pass_rays:,} rays each"
     assert [c.choice for c in made.choices if c.subject == "empty space in fog"] == [
         "skipped",
         "skipped before and behind the content",

@@ -112,7 +112,7 @@ def test_a_folder_of_photographs_becomes_a_page(tmp_path: Path) -> None:
     few = ["--set", "field.longest=16", "--set", "field.effort=0.1", "--set", "show.frames=0"]
     assert main(["optimize", "--as", "grid", "--preset", "capture", str(folder), "-o", str(run), *few]) == 0
     record = json.loads((run / "run.json").read_text())
-    table = next(t for t in record["tables"] if t["title"].startswith("Judged views, at 32 x 24"))
+    table = next(t for t in record["tables"] if t["title"].startswith("Held-out views, at 32 x 24"))
     assert {row[0] for row in table["rows"]} == {"view_00.png", "view_08.png"}
     figures = [float(row[1]) for row in table["rows"]]
     assert figures == sorted(figures) and np.mean(figures) == pytest.approx(record["results"]["held_out_psnr"], abs=0.01)

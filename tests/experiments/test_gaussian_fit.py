@@ -156,7 +156,7 @@ def test_minutes_are_said_before_anything_is_fitted(
 ) -> None:
     path = toml(tmp_path, photographs, effort=1.0, minutes=0.25)
     assert main(["explain", str(path)]) == 0
-    assert "about 0.25 minutes" in capsys.readouterr().out
+    assert "about 15 s: on two idle cores" in capsys.readouterr().out
 
 
 def test_the_example_is_one_of_gaussians() -> None:

@@ -179,7 +179,7 @@ def test_judged_views_are_kept(
     assert [(name, seen) for name, seen, _, edge in record.images if edge is None] == [(f"{k}", k) for k in full]
     assert sorted(name for name, *_ in record.images) == [f"{k}" for k in range(views)]
     assert record.images[0][2] == f"the worst of {views}: PSNR 20.00 dB"
-    assert record.tables[1].title == "Judged views, at 1600 x 1200 pixels, the worst first"
+    assert record.tables[1].title == "Held-out views, at 1600 x 1200 pixels, the worst first"
     assert set(record.tables[1].rows) == {(f"{k}", "20.00") for k in range(views)}
     assert record.judged == f"{views} views at 1600 x 1200 pixels"
     assert record.results == {"views": views, "iterations": 77.0, "gaussians": 3.0, "held_out_psnr": pytest.approx(20.0)}

@@ -103,9 +103,9 @@ def test_distance_and_normals_are_pictures(tmp_path):
 def test_judged_views_are_told_apart_the_worst_first():
     found = [ImageScore("a.jpg", {"psnr": 23.456, "ssim": 0.71234}), ImageScore("b.jpg", {"psnr": 9.0, "ssim": 0.5})]
     table = photo_fit.tabulate_views(camera(135, 240), found, [24.0, 12.345])
-    assert table.title == "Judged views, at 135 x 240 pixels, the worst first"
+    assert table.title == "Held-out views, at 135 x 240 pixels, the worst first"
     assert table.rows == (("b.jpg", "9.00", "0.5000", "12.35"), ("a.jpg", "23.46", "0.7123", "24.00"))
-    assert table.head[3] == "PSNR [dB], colours fitted to the photograph's"
+    assert table.head[3] == "PSNR after colour correction [dB]"
     bare = photo_fit.tabulate_views(camera(135, 240), found)
     assert bare.head == table.head[:3] and bare.rows == tuple(row[:3] for row in table.rows)
 
@@ -188,7 +188,7 @@ def test_many_views_are_smaller_and_none_are_written_where_none_are_asked_for(tm
 
 def test_what_is_said_of_views() -> None:
     quality = ImageScore("a", {"psnr": 24.126, "ssim": 0.7781})
-    assert describe_quality(quality, 25.3) == "PSNR 24.13 dB, SSIM 0.7781, 25.30 dB after a fit of the colours"
+    assert describe_quality(quality, 25.3) == "PSNR 24.13 dB, SSIM 0.7781, 25.30 dB after colour correction"
     assert describe_quality(quality) == "PSNR 24.13 dB, SSIM 0.7781"
     assert describe_views([photo("a")] * 3) == "3 views at 4 x 2 pixels"
     assert describe_views([photo("a")]) == "1 view at 4 x 2 pixels"

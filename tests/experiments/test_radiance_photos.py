@@ -180,7 +180,7 @@ def test_codes_and_radiance_in_one_set_are_refused(photographs: Path, tmp_path: 
     photos, judged = read(toml(tmp_path, tmp_path, 'space = "linear"'))
     np.testing.assert_allclose(photos.views[1].image[7, 7] * photos.white, [0.5, 0.25, 1], atol=0.005)
     np.testing.assert_allclose(judged.views[0].image[7, 7] * judged.white, [0.5, 0.25, 2], rtol=1e-6)
-    assert any("Code values were decoded" in note for note in describe_photos(photos))
+    assert any("converted to radiance" in note for note in describe_photos(photos))
 
 
 def test_gaussians_are_fitted_to_codes(photographs: Path, tmp_path: Path) -> None:

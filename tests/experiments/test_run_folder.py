@@ -250,7 +250,7 @@ def test_the_best_iterate_may_be_files(tmp_path: Path) -> None:
     best.settle()
     assert (run.path / "field_best.npz").read_text() == "1"
     assert best.says() == [
-        "PSNR of a fixed few held-out views was best at iteration 1, 25 dB, and is 22 dB at the end: "
+        "PSNR of the same few held-out views was best at iteration 1, 25 dB, and is 22 dB at the end: "
         "field_best.npz holds the best iterate, all other files hold the last iterate."
     ]
     best.see(3, {"few_psnr": 26.0})

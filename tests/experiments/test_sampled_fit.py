@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
+from mivol.display import format_duration
 from mivol.experiments import sampled_fit
 from mivol.experiments.field_fit import FieldFit
 from mivol.experiments.octree_fit import OctreeFit
@@ -44,7 +45,7 @@ def photographs(alpha: object) -> SimpleNamespace:
             {"levels": 4, "cells": 10},
             {
                 "4 levels of 16 to 64 cells, 2 features each": "numbers in at most 8192 rows a level, and",
-                "8192 samples a step, about 20 a ray at first": "2 along a cell of the map of occupied space, 10 cells an edge",
+                "8192 samples a step, about 20 a ray at first": "cell of the map of occupied cells, with 10 cells an edge",
                 "single precision: rays read a table of 0.2 MiB": 'field.precision = "half" takes half of it',
             },
         ),
@@ -57,15 +58,15 @@ def photographs(alpha: object) -> SimpleNamespace:
             "nerf",
             {"coarse": 16, "fine": 24},
             {
-                "two networks of 3 layers x 32, the place again after layer 2, 32 neurons for the colours; "
-                "16 samples of a ray by a coarse network, 24 more": "5 frequencies of the place, 4 of the direction",
-                "8192 samples a step, about 56 a ray at first": "16 by the coarse network, and by the other at these and at 24",
+                "two networks of 3 layers x 32, the position again after layer 2, 32 neurons for the colours; "
+                "16 samples of a ray by a coarse network, 24 more": "5 frequencies of the position, 4 of the direction",
+                "8192 samples a step, about 56 a ray at first": "the coarse network takes 16, the fine one these and 24 more",
             },
         ),
         (
             "nerf",
             {"harmonics": 2, "skip": 0},
-            {"a network of 3 layers x 32, harmonics of degree 2 for the colours": "5 frequencies of the place, no direction"},
+            {"a network of 3 layers x 32, harmonics of degree 2 for the colours": "frequencies of the position, no direction"},
         ),
     ],
 )
@@ -74,12 +75,12 @@ def test_a_plan_in_words(kind: str, changes: dict, expected: dict) -> None:
     lines = sampled_fit.explain_sampled_plan(plan, photographs(None), SimpleNamespace(bytes=3 << 20))
     said = {line.choice: line.reason for line in lines}
     assert said["2 photographs, a box of 1 x 2 x 3.5 [length]"] == "cameras"
-    assert said["200 steps"] == "field.effort" and said["no field behind the box"] == "photos.background"
+    assert said["200 steps"] == "the preset's, times field.effort" and said["no field behind the box"] == "photos.background"
     for choice, reason in expected.items():
         assert reason in said[choice]
     # 200 steps of 8192 samples: a few levels or a few thousand weights take 0.3 to 5 microseconds a sample.
-    minutes = next(float(choice.split()[1]) for choice in said if choice.endswith(" minutes"))
-    assert 0.3e-6 < minutes * 60 / (200 * 8192) < 5e-6
+    assert f"about {format_duration(60 * plan.minutes)}" in said
+    assert 0.3e-6 < plan.minutes * 60 / (200 * 8192) < 5e-6
     own = lines[-1].choice
     assert own.startswith("about ") and "photographs 3, the fit " in own
     marked = sampled_fit.explain_sampled_plan(plan, photographs(np.ones((4, 4))), SimpleNamespace(bytes=0))

@@ -75,12 +75,18 @@ def row_in_colour() -> Figure:
     return plot_image_row(reference, 0.9 * reference)
 
 
-def cameras() -> Figure:
+def cameras(part: str | None = None, corner: tuple[float, float, float] = (1, 1, 1)) -> Figure:
     views = [Camera(np.array([[20.0, 0, 6], [0, 20, 4], [0, 0, 1]]), (12, 8), pose) for pose in ring(5)]
     splits = ("train", "held_out", "val", "test", "train")
     frames = tuple(PhotoFrame(Path(f"{k}.png"), view, split) for k, (view, split) in enumerate(zip(views, splits, strict=True)))
-    box = np.array([[-1.0, -1, -1], [1, 1, 1]])
-    return plot_cameras(PhotoSurvey(Path("ring"), "COLMAP", frames, (), box, "points", (1.0, 9.0), np.zeros((1, 3))))
+    box = np.outer([-1.0, 1.0], corner)
+    survey = PhotoSurvey(Path("ring"), "COLMAP", frames, (), box, "points", (1.0, 9.0), np.zeros((1, 3)))
+    return plot_cameras(survey, part=part)
+
+
+def flat_ring() -> Figure:
+    """The side view of a page, around a flat box."""
+    return cameras("side", (9, 9, 1))
 
 
 @pytest.mark.parametrize("ends", [(0.0574, 0.13), (0.0090, 0.0125), (1.01, 4.9), (2.01, 10.1), (3.0, 299.0)])
@@ -91,7 +97,7 @@ def test_a_log_axis_has_two_labels_at_least(ends: tuple[float, float]) -> None:
     assert sum(low <= tick <= high for tick in axes.get_yticks()) >= 2
 
 
-DRAWN = [cameras, falling_curve, long_curve, reaching_the_noise, profile, methods, row, row_in_colour]
+DRAWN = [cameras, flat_ring, falling_curve, long_curve, reaching_the_noise, profile, methods, row, row_in_colour]
 
 
 @pytest.mark.parametrize("draw", DRAWN, ids=lambda draw: draw.__name__)

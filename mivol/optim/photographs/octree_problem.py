@@ -342,7 +342,7 @@ class OctreeProblem(SparseProblem, DividedProblem):
         self._begin_tree(build_octree(grid, self.view_rays, self.plan.recipe))
         said.append(self.report("octree", self.tree))
         shapes = {name: value.shape for name, value in self.values().items()}
-        message = f"the grid became an octree of {self.tree.leaves} leaves in 2^{self.tree.depth} cells along an axis"
+        message = f"the grid became an octree of {self.tree.leaves} leaves in {2**self.tree.depth} cells along each axis"
         return Refinement(
             self.values(),
             # A leaf has no node whose means it could take: its first derivative is its mean.
