@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mivol.errors import MivolError
 from mivol.display import format_duration
+from mivol.errors import MivolError
 from mivol.experiments import sampled_fit
 from mivol.experiments.field_fit import FieldFit
 from mivol.experiments.octree_fit import OctreeFit
