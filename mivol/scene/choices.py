@@ -409,6 +409,11 @@ def choose_media_light(needs: Needs, settings: Settings) -> tuple[bool, list[Cho
     return draws, [Choice(subject, method, f"sampling reaches the same error {gain}")]
 
 
+def distance_class(distance: float) -> tuple[bool, bool, bool]:
+    """What a plan depends on in the distance of an emitter to a medium (``Needs.emitter_distances``)."""
+    return distance == 0, distance < NEAR_DISTANCE, math.isinf(distance)
+
+
 def is_near_light_open(needs: Needs, settings: Settings, segment: str) -> bool:
     """Whether a preview decides where the light of near emitters is drawn."""
     can_draw = _explain_missing_near_light(needs, segment) is None

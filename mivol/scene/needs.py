@@ -97,9 +97,7 @@ def find_needs(
         spp=samples,
         is_colour_film=not mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special),
         are_samples_independent=sensor.sampler().class_name() == "IndependentSampler",
-        emitter_distances=_find_emitter_distances(
-            scene, [b for b, m in zip(boundaries, media, strict=True) if m.is_scattering]
-        ),
+        emitter_distances=find_emitter_distances(scene, boundaries, media),
     )
     scatters = needs.surfaces or any(m.is_scattering for m in media)
     refused = any(m.bounded or m.has_own_walk for m in media)
@@ -128,8 +126,9 @@ def _sort_parameters(differentiated: Sequence[tuple[str, mi.Object]]) -> dict[st
     }
 
 
-def _find_emitter_distances(scene: mi.Scene, boundaries: Sequence[Boundary]) -> tuple[float, ...]:
-    """``Needs.emitter_distances`` of the emitters to the media in some boundaries."""
+def find_emitter_distances(scene: mi.Scene, boundaries: Sequence[Boundary], media: Sequence[MediumFacts]) -> tuple[float, ...]:
+    """``Needs.emitter_distances``; ``media`` are the facts of the medium in each boundary."""
+    boundaries = [b for b, m in zip(boundaries, media, strict=True) if m.is_scattering]
     balls = [find_bounding_ball(e) for e in scene.emitters()]
     return tuple(
         math.inf if ball is None else min((_relative_distance(b, ball) for b in boundaries), default=math.inf) for ball in balls

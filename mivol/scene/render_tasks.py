@@ -6,6 +6,7 @@ recording reads the arrays of that call.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
@@ -51,6 +52,8 @@ class PreparedArrays:
         views: sensors of a ``batch``; None for another sensor.
         placements: numbers of boxes, grids and the scene (:func:`prepare_placements`); None while ``dr.freeze`` records.
         tracer: scene of the surfaces alone; None to trace the whole scene.
+        balls: where emitters are (:func:`mivol.transport.estimators.lighting.emitters.read_balls`); None while ``dr.freeze``
+            records.
         asymmetries: the ``g`` of the stock ``hg`` of each medium, which Mitsuba hides from Dr.Jit; None for another phase
             function.
     """
@@ -60,6 +63,7 @@ class PreparedArrays:
     views: mi.SensorPtr | None
     placements: mi.Float64 | None
     tracer: mi.Scene | None
+    balls: mi.Float | None
     asymmetries: list[mi.Float | None] = field(default_factory=list)
 
 
@@ -106,7 +110,8 @@ class PlannedScene:
     @cached_property
     def key(self) -> tuple:
         """All that a recording depends on and does not follow."""
-        return (*self.plan.decisions, self.needs.camera_inside, *self.state.key)
+        are_far = tuple(map(math.isinf, self.needs.emitter_distances))
+        return (*self.plan.decisions, self.needs.camera_inside, are_far, *self.state.key)
 
 
 def prepare_placements(needs: Needs, size: float) -> tuple[mi.Float64 | None, dict[bytes, int]]:
@@ -161,9 +166,8 @@ class RenderTask(RecordedTask):
             needs = self.needs.with_views(self.survey, arrays.asymmetries)
             if arrays.light is not None:
                 needs = replace(needs, media_light=MediaLight(*arrays.light))
-            return build_estimators(
-                scene, needs, self.plan, self.settings, self.survey, self.for_images, arrays.readings, arrays.tracer
-            )
+            made = arrays.readings, arrays.tracer, arrays.balls
+            return build_estimators(scene, needs, self.plan, self.settings, self.survey, self.for_images, *made)
 
     def samples(self, sensor: mi.Sensor, arrays: PreparedArrays, seed: mi.UInt32) -> RenderSamples:
         """The samples of the render."""

@@ -1,8 +1,9 @@
 """The state of a scene's parameters: changes since a plan was made, and changes that a recording follows.
 
 Conventions. A plan holds as long as no parameter has changed. A recording (:mod:`mivol.kernel_recording`) holds longer: it
-reads the values of volumes, textures and phase functions anew in every call. All other parameters are part of its key, since
-parameters such as the place of a shape or the ``scale`` of a stock medium decide on the host which code is traced.
+reads the values of volumes, textures, phase functions, BSDFs, emitters and cameras anew in every call. All other parameters
+are part of its key, since parameters such as the place of a shape or the ``scale`` of a stock medium decide on the host which
+code is traced.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ FOLLOWED = ("data", "value")
 """Names of the parameters of volumes and textures whose values a recording follows."""
 
 PLACES = ("position", "to_world")
-"""Names of the parameters of emitters that decide on the host what is traced."""
+"""Names of the parameters that place an emitter."""
 
 RECORDED_BACK_ENDS = ("llvm",)
 """Back ends on which renders are recorded. On a GPU, Dr.Jit 1.5 reads the handle of a hardware texture from memory that other
@@ -46,6 +47,7 @@ class SceneState:
         values: the arrays that a recording follows, by their indices in Dr.Jit and with their shapes.
         others: all other arrays and numbers.
         of_sensor: the arrays and numbers of the sensor among both.
+        lamps: the places of the emitters among both.
         held: the arrays. Dr.Jit would give the index of a freed array to another array.
         differentiated: keys of the scene's parameters with gradients enabled, with their owners.
     """
@@ -54,6 +56,7 @@ class SceneState:
     values: list = field(default_factory=list)
     others: list = field(default_factory=list)
     of_sensor: list = field(default_factory=list)
+    lamps: list = field(default_factory=list)
     held: list = field(default_factory=list)
     differentiated: list[tuple[str, mi.Object]] = field(default_factory=list)
 
@@ -123,6 +126,8 @@ class SceneState:
             self.held.append(kept)
             state = (indices, dr.shape(kept), dr.grad_enabled(numbers))
             self._sort(owner, is_followed, state)
+            if isinstance(owner, mi.Emitter) and key.rpartition(".")[2] in PLACES:
+                self.lamps.append(indices)
             if state[2]:
                 differentiated.append((key, owner))
                 attached.append(numbers)
@@ -180,7 +185,7 @@ def _is_followed(owner: mi.Object, key: str) -> bool:
     if isinstance(owner, mi.Volume | mi.Texture):
         return name in FOLLOWED
     if isinstance(owner, mi.BSDF | mi.Emitter):
-        return name not in PLACES
+        return True
     if isinstance(owner, mi.Shape):
         return is_painted(name)
     return isinstance(owner, mi.Sensor) and owner.class_name() in ARRAYS

@@ -22,7 +22,9 @@ import mitsuba as mi
 from mivol.back_end import is_on_gpu
 from mivol.errors import MivolError
 from mivol.kernel_recording import CannotRecordError, Recordings, is_recording, without_garbage_collection
+from mivol.scene.choices import distance_class
 from mivol.scene.needs import (
+    find_emitter_distances,
     find_needs,
     may_camera_be_inside,
     read_media,
@@ -50,6 +52,7 @@ from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.stand_in import StandIn, evaluate_samplers, reset_sampler
 from mivol.scene.survey import SceneSurvey, survey_scene
 from mivol.scene_graph import list_values, put_value, traverse, traverse_children
+from mivol.transport.estimators.lighting.emitters import read_balls
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.line_integrals.aovs import integrate_aovs
 from mivol.transport.media.medium_view import MediumView
@@ -308,9 +311,15 @@ class Session:
             is_inside = may_camera_be_inside(scene, sensor, survey)
         if is_inside != needs.camera_inside or [plan_key(m) for m in media] != [plan_key(m) for m in needs.media]:
             return None
+        balls = known.arrays.balls
+        if state.lamps != known.state.lamps:
+            distances = find_emitter_distances(scene, boundaries, media)
+            if list(map(distance_class, distances)) != list(map(distance_class, needs.emitter_distances)):
+                return None
+            balls = read_balls(scene)
         readings = read_parts(replace(needs, views=views), known.plan, survey, for_images)
         self._views = views if for_images else ()
-        return replace(known, state=state, arrays=replace(known.arrays, readings=readings))
+        return replace(known, state=state, arrays=replace(known.arrays, readings=readings, balls=balls))
 
     def _plan(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, state: SceneState, for_images: bool) -> PlannedScene:
         """Find the needs, plan, and read values."""
@@ -331,8 +340,8 @@ class Session:
             placements, places = known.arrays.placements, known.places
         else:
             placements, places = prepare_placements(needs, survey.size)
-        readings = read_parts(needs, plan, survey, for_images)
-        arrays = PreparedArrays(readings, light, find_batch_views(sensor), placements, survey.usable_tracer)
+        readings, balls = read_parts(needs, plan, survey, for_images), None if is_recording() else read_balls(scene)
+        arrays = PreparedArrays(readings, light, find_batch_views(sensor), placements, survey.usable_tracer, balls)
         self._views = needs.views if for_images and not is_recording() else ()
         facts = replace(needs, views=(), media_light=None)
         opened = PlannedScene(state, spp, survey, facts, plan, arrays, settings, places)

@@ -98,7 +98,7 @@ SCENES: dict[str, tuple[Callable[[], mi.Scene], int, list[str]]] = {
         4,
         [INSIDE + key for key in ("phase_function.g", "sigma_t.data")],
     ),
-    "lamp": (lamp_in_fog, 5, [INSIDE + "sigma_t.value.value", "floor.bsdf.reflectance.value"]),
+    "lamp": (lamp_in_fog, 5, [INSIDE + "sigma_t.value.value", "floor.bsdf.reflectance.value", "lamp.position"]),
     "maps": (lit_by_maps, 3, ["sky.data", "sky.scale", "spot.beam_width"]),
     "surfaces": (before_painted_faces, 3, ["wall.vertex_color", "ball.bsdf.alpha"]),
     "fire": (fire, 3, [INSIDE + "emission_density.data", INSIDE + "sigma_t.data"]),
@@ -346,10 +346,9 @@ def test_values_that_plugins_compute_are_known_by_their_sources(key: str, comput
     ("make", "key", "value"),
     [
         (lambda: smoke_under("heterogeneous"), INSIDE + "scale", lambda: 2.0),
-        (lamp_in_fog, "lamp.position", lambda: mi.Point3f(-0.3, 0.2, 0.1)),
         (lamp_in_fog, "smoke.to_world", lambda: mi.AffineTransform4f().translate([0.2, 0, 0])),
     ],
-    ids=["scale", "lamp", "boundary"],
+    ids=["scale", "boundary"],
 )
 def test_what_a_recording_does_not_follow_is_recorded_anew(make: Callable, key: str, value: Callable) -> None:
     pair = Pair(make(), 4)
@@ -359,6 +358,51 @@ def test_what_a_recording_does_not_follow_is_recorded_anew(make: Callable, key: 
     pair.params.update()
     pair.assert_same(1)
     assert not np.array_equal(pair.images(1)[0], before)
+
+
+def look_from(x: float) -> mi.AffineTransform4f:
+    return mi.AffineTransform4f().look_at([x, -2, 3], [0, 0, 0], [0, 0, 1])
+
+
+MOVES: dict[str, tuple[Callable[[], mi.Scene], int, str, Callable[[float], object]]] = {
+    "two lamps": (
+        lambda: smoke_under(lamp=point((0.2, 0.1, 2.0))[0], other=point((0.2, 0.1, 2.0))[0]),
+        3,
+        "other.position",
+        lambda x: mi.Point3f(x, 0.1, 2.0),
+    ),
+    "spot": (lit_by_maps, 3, "spot.to_world", look_from),
+    "map": (lit_by_maps, 3, "sky.to_world", look_from),
+    "sun": (lambda: smoke_under(sun=sun([0.3, 0.2, -1.0])[0]), 2, "sun.to_world", look_from),
+}
+"""A scene, its depth, a parameter, and values of the parameter."""
+
+
+@pytest.mark.parametrize("name", cases(MOVES, slow=("map",)))
+def test_the_place_of_an_emitter_is_followed(name: str) -> None:
+    """To the last bit. Two lamps begin at one place."""
+    make, depth, key, at = MOVES[name]
+    pair, sums = Pair(make(), depth), set()
+    pair.assert_same(0)
+    for x in (1.0, 1.2, 1.4, 0.9):
+        pair.params[key] = at(x)
+        pair.params.update()
+        pair.assert_same(0)
+        sums.add(pair.images(0)[0].sum())
+        if x == 1.2:
+            count = pair.recordings.count
+    assert len(sums) == 4 and pair.recordings.count == count and not any(pair.recordings.failures.values())
+
+
+def test_a_lamp_that_moves_into_the_smoke_is_planned_anew() -> None:
+    pair, found = Pair(smoke_under(lamp=point((0.1, 0.1, 9.0))[0]), 3), []
+    for z in (9.0, 8.0, 0.1, 0.2, 8.0):
+        pair.params["lamp.position"] = mi.Point3f(0.1, 0.1, z)
+        pair.params.update()
+        truth = mi.render(pair.scene, integrator=mi.load_dict(mivol(max_depth=3)), seed=1, spp=2)
+        assert np.array_equal(np.array(truth), pair.images(1)[0])
+        found.append(pair.recorded.session._opened[True].plan.draws_near_light)
+    assert found == [False, False, True, True, False]
 
 
 def test_a_bad_value_is_refused_after_good_ones() -> None:
@@ -616,9 +660,10 @@ def test_what_cannot_be_recorded_is_named() -> None:
     assert find_hidden_arrays(scene, scene.sensors()[0]) is None
     dr.enable_grad(params[INSIDE + "phase_function.g"])
     assert find_hidden_arrays(scene, scene.sensors()[0]) is None
-    lamp = smoke_under(lamp=point((0.2, 0.1, 3.3))[0])
-    dr.enable_grad(mi.traverse(lamp)["lamp.position"])
-    assert find_hidden_arrays(lamp, lamp.sensors()[0]) == "a recording does not follow the derivative by lamp.position"
+    lobed = smoke_under(phase={"type": "mivol_mixture", "a": {"type": "hg"}, "b": {"type": "isotropic"}})
+    key = next(key for key in mi.traverse(lobed).properties if key.endswith(".g"))
+    dr.enable_grad(mi.traverse(lobed)[key])
+    assert find_hidden_arrays(lobed, lobed.sensors()[0]) == f"a recording does not follow the derivative by {key}"
 
 
 def test_a_python_plugin_of_another_package_is_not_recorded() -> None:

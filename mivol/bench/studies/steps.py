@@ -30,7 +30,7 @@ of 24^2 pixels.
 
 Milliseconds are wall times: medians over the steps after the first ``WARM`` ones, in which both integrators compile. A ratio is
 the time of ``prbvolpath`` over the time of mivol, without regard to their noise (``mivol bench everyday`` compares errors).
-Launches are kernels, copies and fills of one step.
+Launches are kernels, copies and fills of one step; those in brackets leave out the update of the parameter.
 """
 
 from __future__ import annotations
@@ -112,12 +112,25 @@ class _Loop:
 
     def step(self, differentiates: bool) -> None:
         """Put another value, render, and differentiate on request."""
+        self.put_value(differentiates)
+        self.render(differentiates)
+
+    def count_render_launches(self, differentiates: bool) -> int:
+        """Launches of a step without those that put its value."""
+        self.put_value(differentiates)
+        return count_launches(partial(self.render, differentiates))
+
+    def put_value(self, is_differentiated: bool) -> None:
+        """Put another value of the parameter."""
         self.count += 1
         value = type(self.start)(self.start * (1 - 1e-4 * self.count))
-        if differentiates:
+        if is_differentiated:
             dr.enable_grad(value)
         self.params[self.key] = value
         self.params.update()
+
+    def render(self, differentiates: bool) -> None:
+        """Render, and differentiate on request."""
         image = mi.render(self.scene, self.params, integrator=self.integrator, spp=self.spp, seed=self.count)
         if differentiates:
             dr.backward(dr.mean(image, axis=None))
@@ -255,7 +268,8 @@ def measure_steps(differentiates: bool, size: StepsSize) -> dict:
 
 
 def _contend(loops: dict[str, _Loop], size: StepsSize, differentiates: bool) -> dict:
-    return race_steps({name: partial(loop.step, differentiates) for name, loop in loops.items()}, size.steps)
+    row = race_steps({name: partial(loop.step, differentiates) for name, loop in loops.items()}, size.steps)
+    return row | {"render_launches": {name: loop.count_render_launches(differentiates) for name, loop in loops.items()}}
 
 
 def race_steps(steps: dict[str, Callable[[], object]], count: int) -> dict:
@@ -356,6 +370,8 @@ def table(question: str, answer: dict) -> list[str]:
         ms, launches = row["milliseconds"], row["launches"]
         if PEER in ms:
             counts = f"{launches[PEER]} / {launches['mivol']}"
+            if "render_launches" in row:
+                counts += f" ({row['render_launches'][PEER]} / {row['render_launches']['mivol']})"
             lines.append(f"| {name} | {ms[PEER]:.3g} | {ms['mivol']:.3g} | {row['ratio']:.3g} | {counts} |")
         else:
             lines.append(f"| {name} | | {ms['mivol']:.3g} | | {launches['mivol']} |")

@@ -97,7 +97,8 @@ def walk_successively(
     n = dr.width(ray)
     lanes, paths = -(-n // count), _WorkList(dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, 0))
     starts = leave_camera(estimators, sampler.clone(), ray)
-    L, alpha = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Float, n)
+    # Each path writes its own results once.
+    L, alpha = dr.empty(mi.Spectrum, n), dr.empty(mi.Float, n)
     kept = KeptShadow.empty(n) if estimators.tabulates_shadows else None
     dr.eval(starts, L, alpha, kept)
 

@@ -162,6 +162,7 @@ class DirectLighting:
 
     Args:
         media: media and surfaces of the scene.
+        balls: numbers of :func:`mivol.transport.estimators.lighting.emitters.read_balls`; by default read from the scene.
 
     Attributes:
         shadow_table: table of the shadows of vertices in media, in images; None for shadow rays.
@@ -169,14 +170,14 @@ class DirectLighting:
 
     shadow_table: TransmittanceGrid | None
 
-    def __init__(self, media: SceneMedia) -> None:
-        self.media, self.shadow_table = media, None
+    def __init__(self, media: SceneMedia, balls: mi.Float | None = None) -> None:
+        self.media, self.shadow_table, self._balls = media, None, balls
 
     @cached_property
     def emitters(self) -> SceneEmitters:
         """The emitters of the scene. Their tables are made at the first call, which must not lie in a recorded loop."""
         with dr.suspend_grad():
-            return SceneEmitters(self.media.scene, self.media.start is not None)
+            return SceneEmitters(self.media.scene, self.media.start is not None, balls=self._balls)
 
     @cached_property
     def near_emitters(self) -> SceneEmitters:
@@ -193,7 +194,7 @@ class DirectLighting:
         if all((everyone.bounding_ball(k) is not None) == (distance == "near") for k in range(len(everyone.sampled))):
             return everyone
         with dr.suspend_grad():
-            return SceneEmitters(self.media.scene, self.media.start is not None, distance)
+            return SceneEmitters(self.media.scene, self.media.start is not None, distance, self._balls)
 
     def sample_emitter(
         self, it: mi.Interaction3f, u: mi.Point2f, active: mi.Bool, emitters: SceneEmitters | None = None

@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.kernel_recording import copy_aligned, is_recording
 from mivol.transport.estimators.lighting.emitter_grid import EmitterDistribution, tabulate_emitters
 from mivol.transport.traversal.random_numbers import SpreadSampler, draw_state, fork_state
 from mivol.transport.traversal.rays import Ray
@@ -34,6 +35,7 @@ __all__ = [
     "EquiangularSampler",
     "make_ball_sampler",
     "make_equiangular_sampler",
+    "read_balls",
 ]
 
 
@@ -50,6 +52,7 @@ class SceneEmitters:
         scene: Mitsuba's scene.
         from_camera: media surround the camera, so rays scatter light from their origin on.
         distance: ``near`` for the emitters with a position alone, ``far`` for the emitters at infinity alone, ``any`` for all.
+        balls: numbers of :func:`read_balls`; by default read from the scene.
 
     Attributes:
         sampled: emitters that next-event estimation chooses from: all except a constant environment.
@@ -59,18 +62,19 @@ class SceneEmitters:
         are_evaluated: ``eval_direction`` of all emitters of the scene is there.
     """
 
-    def __init__(self, scene: mi.Scene, from_camera: bool = False, distance: str = "any") -> None:
-        emitters = scene.emitters()
+    def __init__(
+        self, scene: mi.Scene, from_camera: bool = False, distance: str = "any", balls: mi.Float | None = None
+    ) -> None:
+        placed = list(zip(scene.emitters(), _find_balls(scene, balls), strict=True))
         if distance != "any":
-            emitters = [e for e in emitters if (find_bounding_ball(e) is not None) == (distance == "near")]
-        delta = int(mi.EmitterFlags.Delta)
+            placed = [(e, ball) for e, ball in placed if (ball is not None) == (distance == "near")]
+        emitters, delta = [e for e, _ in placed], int(mi.EmitterFlags.Delta)
         self.sampled = [e for e in emitters if e.class_name() != UNIFORM_EMITTER]
         self.transmissive = [e for e in self.sampled if _is_transmissive(e)]
         opaque = [e for e in emitters if not any(e is emitter for emitter in self.transmissive)]
         self.samples_phase = any(not int(e.flags()) & delta for e in opaque)
-        balls = [find_bounding_ball(e) for e in self.sampled]
-        self.is_near = any(b is not None for b in balls)
-        self._balls = [None if b is None else [dr.opaque(mi.Float, v) for v in b] for b in balls]
+        self._balls = [ball for e, ball in placed if e.class_name() != UNIFORM_EMITTER]
+        self.is_near = any(ball is not None for ball in self._balls)
         self._from_camera = from_camera
         # Dr.Jit records a call for every emitter of the scene, chosen or not.
         self.are_evaluated = all(e.class_name() != PARALLEL_AREA for e in scene.emitters())
@@ -264,6 +268,33 @@ def find_bounding_ball(emitter: mi.Emitter) -> list[float] | None:
     if emitter.is_environment() or not np.isfinite([low, high]).all() or (high < low).any():
         return None
     return [*((low + high) / 2), float(np.linalg.norm(high - low) / math.sqrt(12))]
+
+
+def read_balls(scene: mi.Scene) -> mi.Float | None:
+    """Centre and radius of each emitter that has a position (:func:`find_bounding_ball`), flat, as an input of recordings.
+    None without such emitters.
+    """
+    balls = [ball for e in scene.emitters() if (ball := find_bounding_ball(e)) is not None]
+    return mi.Float(copy_aligned(np.array(balls, np.float32).ravel())) if balls else None
+
+
+def _find_balls(scene: mi.Scene, numbers: mi.Float | None) -> list[list[mi.Float] | None]:
+    """Centre and radius of each emitter of a scene; None for an emitter at infinity.
+
+    Args:
+        scene: Mitsuba's scene.
+        numbers: of :func:`read_balls`; None to read them here.
+    """
+    balls = [find_bounding_ball(e) for e in scene.emitters()]
+    if numbers is None:
+        return [None if ball is None else [dr.opaque(mi.Float, v) for v in ball] for ball in balls]
+    # Outside of recordings, Dr.Jit copies the number at a literal index at once.
+    start = mi.UInt32(0) if is_recording() else dr.opaque(mi.UInt32, 0)
+    firsts = np.cumsum([0, *(0 if ball is None else len(ball) for ball in balls)])
+    return [
+        None if ball is None else [dr.gather(mi.Float, numbers, start + int(first + k)) for k in range(len(ball))]
+        for ball, first in zip(balls, firsts[:-1], strict=True)
+    ]
 
 
 def is_among(emitters: list[mi.Emitter], emitter: mi.EmitterPtr) -> mi.Bool:
