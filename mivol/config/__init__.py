@@ -26,6 +26,7 @@ from mivol.config.photos import (
     NerfExperiment,
     OctreeExperiment,
     OctreeSettings,
+    PhotoExperiment,
     ShowSettings,
 )
 from mivol.config.scans import (
@@ -64,9 +65,6 @@ takes a minute."""
 
 LONGEST_SENTENCE = 600
 """Characters of an error message, which quotes values of any length."""
-
-PhotoExperiment = FieldExperiment | HashExperiment | NerfExperiment | OctreeExperiment | GaussianExperiment
-"""A fit of photographs, with one of the models."""
 
 Experiment = SceneExperiment | ScanExperiment | PhotoExperiment
 """An experiment of any kind."""

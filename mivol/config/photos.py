@@ -159,18 +159,23 @@ class ShowSettings(Section):
             check_word(name, METRICS, "metric")
 
 
-class FieldExperiment(Section):
-    """A fit of a radiance field to photographs: a file with a table ``[photos]``."""
+class PhotoExperiment(Section):
+    """Settings of all fits to photographs."""
 
     title: Title
     photos: Annotated[Photographs, setting("1", "the photographs")]
-    field: Annotated[FieldSettings, setting("1", "the radiance field and its fit")] = FieldSettings()
     show: Annotated[ShowSettings, setting("1", "images, film and curve")] = ShowSettings()
     checkpoint_every: CheckpointSteps = 500
     variant: Variant = "llvm_ad_rgb"
     seed: Seed = 0
     threads: Threads = 0
     output: Output = "runs/field"
+
+
+class FieldExperiment(PhotoExperiment, kw_only=True):
+    """A fit of a radiance field to photographs: a file with a table ``[photos]``."""
+
+    field: Annotated[FieldSettings, setting("1", "the radiance field and its fit")] = FieldSettings()
 
 
 class HashSettings(Section):
@@ -201,18 +206,10 @@ class HashSettings(Section):
             raise ValueError(f"features is {self.features}: 1, 2, 4 or 8 is expected")
 
 
-class HashExperiment(Section):
+class HashExperiment(PhotoExperiment, kw_only=True):
     """A fit of a hash grid to photographs: a file with a table ``[photos]``, and ``kind = "hash"`` in its table ``[field]``."""
 
-    title: Title
-    photos: Annotated[Photographs, setting("1", "the photographs")]
     field: Annotated[HashSettings, setting("1", "the hash grid and its fit")]
-    show: Annotated[ShowSettings, setting("1", "images, film and curve")] = ShowSettings()
-    checkpoint_every: CheckpointSteps = 500
-    variant: Variant = "llvm_ad_rgb"
-    seed: Seed = 0
-    threads: Threads = 0
-    output: Output = "runs/field"
 
 
 class NerfSettings(Section):
@@ -251,18 +248,10 @@ class NerfSettings(Section):
     cells: Annotated[int, setting("cell", "edge of the map of occupied cells; absent: preset", ge=4, le=256)] | None = None
 
 
-class NerfExperiment(Section):
+class NerfExperiment(PhotoExperiment, kw_only=True):
     """A fit of a NeRF to photographs: a file with a table ``[photos]``, and ``kind = "nerf"`` in its table ``[field]``."""
 
-    title: Title
-    photos: Annotated[Photographs, setting("1", "the photographs")]
     field: Annotated[NerfSettings, setting("1", "the network and its fit")]
-    show: Annotated[ShowSettings, setting("1", "images, film and curve")] = ShowSettings()
-    checkpoint_every: CheckpointSteps = 500
-    variant: Variant = "llvm_ad_rgb"
-    seed: Seed = 0
-    threads: Threads = 0
-    output: Output = "runs/field"
 
 
 class OctreeSettings(Section):
@@ -304,17 +293,10 @@ class OctreeSettings(Section):
     steps: Annotated[int, setting("step", "steps of the fit of the leaves, before effort", ge=1)] = 400
 
 
-class OctreeExperiment(Section):
+class OctreeExperiment(PhotoExperiment, kw_only=True):
     """A fit of an octree to photographs: a file with a table ``[photos]``, and ``kind = "octree"`` in its table ``[field]``."""
 
-    title: Title
-    photos: Annotated[Photographs, setting("1", "the photographs")]
     field: Annotated[OctreeSettings, setting("1", "the octree and its fit")]
-    show: Annotated[ShowSettings, setting("1", "images, film and curve")] = ShowSettings()
-    checkpoint_every: CheckpointSteps = 500
-    variant: Variant = "llvm_ad_rgb"
-    seed: Seed = 0
-    threads: Threads = 0
     output: Output = "runs/octree"
 
 
@@ -345,15 +327,8 @@ class GaussianSettings(Section):
             raise ValueError(f"minutes is {self.minutes} beside effort {self.effort}: only one of the two is expected")
 
 
-class GaussianExperiment(Section):
+class GaussianExperiment(PhotoExperiment, kw_only=True):
     """A fit of Gaussians to photographs: a file with tables ``[photos]`` and ``[gaussians]``."""
 
-    title: Title
-    photos: Annotated[Photographs, setting("1", "the photographs")]
     gaussians: Annotated[GaussianSettings, setting("1", "the Gaussians and their fit")]
-    show: Annotated[ShowSettings, setting("1", "images, film and curve")] = ShowSettings()
-    checkpoint_every: CheckpointSteps = 500
-    variant: Variant = "llvm_ad_rgb"
-    seed: Seed = 0
-    threads: Threads = 0
     output: Output = "runs/gaussians"
