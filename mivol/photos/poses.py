@@ -97,7 +97,7 @@ class Poses:
             sizes = ", ".join(str(len(names)) for names in self.others)
             first = self.others[0][0]
             lines.append(
-                f"{sizes} photographs ({first}, ...) have poses in models of their own, which share nothing with it; "
+                f"{sizes} photographs ({first}, ...) have poses in separate models, which share nothing with it; "
                 f"photograph what lies between {first} and {self.posed[-1]}, or put another place into a folder of its own"
             )
         apart = {name for names in self.others for name in names}

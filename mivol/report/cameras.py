@@ -476,7 +476,7 @@ def write_poses_page(folder: Path, poses: Poses) -> Path:
         ("cameras (lens and size)", str(poses.cameras)),
         ("without a pose", ", ".join(poses.unposed) or "none"),
         ("damaged, or copies of others", ", ".join(poses.left_out) or "none"),
-        ("in models of their own", ", ".join(", ".join(names) for names in poses.others) or "none"),
+        ("in separate models", ", ".join(", ".join(names) for names in poses.others) or "none"),
     ]
     table = "".join(f"<tr><th align=left>{html.escape(head)}</th><td>{html.escape(cell)}</td></tr>" for head, cell in rows)
     text = (

@@ -315,7 +315,6 @@ def plot_error_against_time(
     *,
     error: str = "relative RMS error",
     title: str = "",
-    time: str = "time [s], warm",
 ) -> Figure:
     """Plot error against time of several methods in log-log, and compare the first method with the others.
 
@@ -324,7 +323,6 @@ def plot_error_against_time(
         path: file to write (.svg or .png), optional.
         error: label of the vertical axis.
         title: question answered by the figure.
-        time: label of the horizontal axis.
 
     Returns:
         The figure. The legend gives the ratio of the times at equal error for each other method
@@ -345,14 +343,14 @@ def plot_error_against_time(
                 np.asarray(s.error)[order],
                 marker=MARKERS[i % len(MARKERS)],
                 color=SERIES[i % len(SERIES)],
-                label=_legend(s.name, ratios.get(s.name)),
+                label=_legend(s.name, ratios.get(s.name), series[0].name),
                 zorder=3 + (i == 0),
                 linewidth=2.4 if i == 0 else 1.5,
                 markeredgecolor="white",
                 markeredgewidth=0.7,
                 markersize=6.5 if len(order) <= 12 else 4,
             )
-        axes.set(xlabel=time, ylabel=error, title=title)
+        axes.set(xlabel="time of a call after the first [s]", ylabel=error, title=title)
         _log_axis(axes.xaxis, np.concatenate([np.ravel(s.seconds) for s in series]))
         _log_axis(axes.yaxis, np.concatenate([np.ravel(s.error) for s in series]))
         _draw_arrow(axes, [ratio for ratio in ratios.values() if ratio])
@@ -363,8 +361,8 @@ def plot_error_against_time(
     return figure
 
 
-def _legend(name: str, ratio: tuple[float, float, float] | None) -> str:
-    return f"{name}\n{_format_ratio(ratio)} the time" if ratio else name
+def _legend(name: str, ratio: tuple[float, float, float] | None, first: str) -> str:
+    return f"{name}\n{_format_ratio(ratio)} the time of {first}" if ratio else name
 
 
 def _format_ratio(ratio: tuple[float, float, float]) -> str:

@@ -74,7 +74,7 @@ def test_the_largest_model_is_kept_and_the_rest_is_named(
     said = capsys.readouterr().out
     for fact in (
         f"{folder / 'sparse' / '0'}: 3 of 5 photographs have poses, 7 points, 1 camera, reprojection error 0.50 pixels",
-        "1 photographs (near/e.jpg, ...) have poses in models of their own",
+        "1 photographs (near/e.jpg, ...) have poses in separate models",
         "photograph what lies between near/e.jpg and near/d.jpg, or put another place into a folder of its own",
         "without a pose: near/c.webp (few matches: 21 points in common with a.jpg); photograph again",
         f"mivol optimize {folder} fits Gaussians",

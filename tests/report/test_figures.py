@@ -112,7 +112,7 @@ def test_a_figure_is_readable(draw: Callable[[], Figure]) -> None:
         (long_curve, "PSNR of the fitted views [dB]", "time [s]", ("linear", "linear")),
         (reaching_the_noise, "RMS of residual over noise (noise level: 1)", "iteration", ("linear", "log")),
         (profile, "sigma_t [1/length]", "y [length]", ("linear", "linear")),
-        (methods, "Which is sooner?", "time [s], warm", ("log", "log")),
+        (methods, "Which is sooner?", "time of a call after the first [s]", ("log", "log")),
     ],
 )
 def test_curves_name_their_quantities_with_units(draw: Callable[[], Figure], title: str, x: str, scales: tuple) -> None:

@@ -53,13 +53,6 @@ class PathEvent:
         reaches_end = active if collision is None else active & ~collision.on
         return cls(end.si, end.t, end.medium, reaches_end & end.si.is_valid(), collision, estimate.chance)
 
-    @classmethod
-    def from_collision(cls, collision: Collision, chance: mi.Float | None = None) -> PathEvent:
-        """The event of a path beginning at a collision."""
-        n = dr.width(collision.on)
-        si, t, nowhere = dr.zeros(mi.SurfaceInteraction3f, n), mi.Float(0), dr.full(mi.Bool, False, n)
-        return cls(si, t, collision.mei.medium, nowhere, collision, chance)
-
     def begin_at(self, collision: Collision) -> PathEvent:
         """These events, and in the lanes of a collision, whose paths have not moved, the event of a path beginning there."""
         on = collision.on
