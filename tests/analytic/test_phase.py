@@ -403,6 +403,15 @@ def test_particles_that_cannot_be_are_refused(twin, call):
     assert_refused("expected", call)
 
 
+def test_the_largest_particles_are_limited_in_wavelengths(twin, monkeypatch):
+    """The limit is set to the size 2 pi r / wavelength of the largest particles in light of a micrometre."""
+    monkeypatch.setattr(mie, "RADII", 2)
+    largest = mie._ends_of_lognormal(0.1, np.log(1.2))[1]
+    monkeypatch.setattr(mie, "LARGEST_SIZE", 2 * np.pi * largest)
+    assert mie.aerosol(0.1, 1.2, 1.5, wavelength=1.01).density.min() > 0
+    assert_refused("largest particles", mie.aerosol, 0.1, 1.2, 1.5, wavelength=0.99)
+
+
 def test_named_media_are_the_published_ones():
     """A few numbers of each table; the scattering coefficients of the second table as printed, computed from the reduced
     ones."""

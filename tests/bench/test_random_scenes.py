@@ -69,6 +69,17 @@ def test_everything_is_drawn(variant_rgb: str) -> None:
     assert wanted | set(EMITTERS) <= drawn
 
 
+def test_a_camera_inside_is_in_the_body_of_its_medium(variant_rgb: str) -> None:
+    """Within 0.4 of its centre, in the first of two bodies side by side as well; half an edge is 0.7 or more."""
+    drawn = [scene for scene in map(draw_scene, range(60)) if "camera inside" in scene.features]
+    assert {"other" in scene.parts for scene in drawn} == {False, True}
+    for scene in drawn:
+        body = mi.load_dict({"type": "scene", "body": scene.parts["body"]}).shapes()[0]
+        camera = scene.parts["sensor"]["to_world"] @ mi.ScalarPoint3f(0)
+        assert np.linalg.norm(camera - body.bbox().center()) < 0.4
+        assert scene.parts["sensor"]["medium"]["id"] == "m1"
+
+
 def test_a_channel_is_that_of_the_rgb_extinction(variant_rgb: str) -> None:
     """The grey scenes of the channels have the grids of the colours, and all else alike."""
     seed = next(seed for seed in range(50) if draw_scene(seed).is_rgb)

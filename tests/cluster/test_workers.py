@@ -116,6 +116,11 @@ def test_files_without_certificates_are_refused(tmp_path: Path) -> None:
         _connect_address(import_distributed(), parse_cluster(str(tmp_path / "tls.toml")))
 
 
+def test_messages_of_dask_are_not_shown() -> None:
+    import_distributed()
+    assert not logging.getLogger("distributed.scheduler").isEnabledFor(logging.CRITICAL)
+
+
 def test_loopback() -> None:
     assert all(map(is_loopback, ("localhost", "127.0.0.1", "127.8.0.1", "::1")))
     assert not any(map(is_loopback, ("", "0.0.0.0", "10.0.0.1", "node1", "localhost.example.org")))

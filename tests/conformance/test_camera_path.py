@@ -9,7 +9,8 @@ from refusals import assert_refused
 from scipy.spatial.transform import Rotation
 
 from mivol.photos import Camera, aim_camera, interpolate_cameras, intrinsics, project, turntable
-from mivol.photos.camera_path import HomeView, find_home_view
+from mivol.photos.camera_path import WIDE, HomeView, find_home_view
+from mivol.photos.lens import Panorama
 
 LIKE = Camera(intrinsics(90, 100, 30, 20), (64, 48), np.eye(4))
 BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
@@ -103,6 +104,12 @@ def test_the_first_view_is_upright_and_looks_at_the_box() -> None:
     assert (view.size, view.scaled(120)) == ((12, 8), (120, 80))
     np.testing.assert_allclose(view.fov, 2 * np.degrees(np.arctan(6 / 20)))
     assert HomeView.from_numbers(view.numbers, "file") == view
+
+
+def test_the_first_view_through_a_wide_lens_is_as_wide_as_a_plain_one() -> None:
+    """A panorama sees all around; its first view has WIDE degrees."""
+    cameras = [Camera(intrinsics(64 / (2 * np.pi), 48 / np.pi, 32, 24), (64, 48), pose, Panorama()) for pose in ring(4)]
+    assert find_home_view(cameras, BOX).fov == WIDE
 
 
 @pytest.mark.parametrize("numbers", [(1.0,) * 11, (np.nan,) * 12, (1.0,) * 9 + (0.0, 4.0, 4.0)])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mivol.experiments.script import explain
-from mivol.scene.explain import choose_recording
+from mivol.scene.explain import _padded_box, choose_recording
 from scenes import ball_of, box_of, camera, centred, grid_volume, medium
 
 PLACE = centred(2 * np.eye(3))
@@ -28,6 +28,14 @@ def test_a_number_in_a_box_is_homogeneous():
     assert ", grey extinction, homogeneous, albedo 0, IsotropicPhaseFunction, optical depth at most 1.73" in found["medium"]
     assert (found["surfaces"], found["emitters"]) == ("none", "none")
     assert found["camera"] == "outside all traced boundaries" and found["variant"].startswith(mi.variant())
+
+
+def test_the_padded_box_holds_the_medium():
+    """A cube from -1 to 1, and a thousandth of its edge on each side."""
+    scene = mi.load_dict({"type": "scene", "fog": box_of(medium("homogeneous", 0.5), PLACE)})
+    place = _padded_box(scene, scene.shapes()[0].interior_medium()).to_world
+    corners = np.array([[0, 0, 0, 1], [1, 1, 1, 1]]) @ np.array(place).T
+    np.testing.assert_allclose(corners[:, :3], [[-1.002] * 3, [1.002] * 3], rtol=1e-6)
 
 
 def test_a_grid_says_its_voxels_and_a_bounded_field_its_name():

@@ -327,6 +327,15 @@ def test_bad_bricks_are_refused(given: dict, words: str) -> None:
     assert words in str(caught.value)
 
 
+def test_fewer_values_than_the_slots_are_stored(monkeypatch: pytest.MonkeyPatch) -> None:
+    volume = plugin(cut(np.ones((9, 9, 9, 1), np.float32)))
+    monkeypatch.setattr(voxels, "MOST_SLOTS", 8 * 512 + 1)
+    mi.load_dict(volume)
+    monkeypatch.setattr(voxels, "MOST_SLOTS", 8 * 512)
+    with pytest.raises(RuntimeError, match=r"fewer than 2\^31 values"):
+        mi.load_dict(volume)
+
+
 def test_a_bad_voxel_is_named_by_its_place_in_the_box() -> None:
     values = np.ones((9, 9, 9, 1), np.float32)
     values[8, 2, 7] = -1
