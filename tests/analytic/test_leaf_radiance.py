@@ -15,9 +15,9 @@ from mivol.fields.octree import MAX_DEPTH, Octree, interleave, separate
 from mivol.transport.line_integrals.leaf_radiance import (
     HALF_MAX,
     HalfColours,
+    LeafColours,
     LeafPlaces,
     make_leaf_colours,
-    make_leaf_harmonics,
     raise_leaf_weights,
     render_leaves,
     vjp_leaf_colours,
@@ -37,12 +37,22 @@ def basis_of(tree: Octree, d: np.ndarray) -> np.ndarray:
     return np.stack([np.broadcast_to(np.array(y), len(d)) for y in rows], axis=1).astype(np.float64)
 
 
+def leaves_along(tree: Octree, d: np.ndarray, slope: bool = False) -> LeafColours:
+    """The leaves in the direction of each ray: a block of the table for each ray."""
+    density, sh = (np.float64(v) for v in tree.values())
+    sums = np.einsum("rb,lbc->rlc", basis_of(tree, d), sh) + tree.offset
+    colours = np.maximum(sums, 0) if tree.colours == "clamp" else 1 / (1 + np.exp(-sums))
+    table = np.concatenate([np.broadcast_to(density[:, None], (len(d), tree.leaves, 1)), colours], axis=2)
+    first = mi.UInt32(np.arange(len(d), dtype=np.uint32) * tree.leaves)
+    return LeafColours(mi.Float(np.float32(table.ravel())), first, dr.zeros(mi.Float, table.size) if slope else None)
+
+
 @pytest.mark.parametrize("depth, split", [(1, 0.5), (5, 0.55), (8, 0.3), (9, 0.3), (12, 0.2)])
 @pytest.mark.parametrize("colours", ["clamp", "sigmoid"])
 def test_agrees_with_the_twin(variant_rgb: str, depth: int, split: float, colours: str) -> None:
     tree, (o, d) = random_octree(depth, split=split, colours=colours), hard_rays()
     rays = bundle(o, d)
-    rendered = render_leaves(LeafIndex.find(tree), make_leaf_harmonics(tree, rays.d), rays, distances=True)
+    rendered = render_leaves(LeafIndex.find(tree), leaves_along(tree, d), rays, distances=True)
     basis, values = basis_of(tree, d), [np.float64(v) for v in tree.values()]
     expected = [twin(tree, *values, *ray) for ray in zip(o, d, basis, strict=True)]
     # Positions err by 2^-23 (X + Y + Z) = 3.6e-7 of the cube, extinctions differ by up to 3 from leaf to leaf; the errors of
@@ -92,7 +102,7 @@ def test_uniform_leaves_are_a_grid_of_nearest_nodes(variant_rgb: str) -> None:
     tree, density, sh = uniform(n, 3)
     o, d = (a[20:] for a in hard_rays(3))
     rays = bundle(o, d)
-    rendered = render_leaves(LeafIndex.find(tree), make_leaf_harmonics(tree, rays.d), rays)
+    rendered = render_leaves(LeafIndex.find(tree), leaves_along(tree, d), rays)
     inverse, basis = np.linalg.inv(PLACE), basis_of(tree, d)
     for i in range(len(o)):
         q, v = inverse[:3] @ np.append(np.float64(o[i]), 1), inverse[:3, :3] @ np.float64(d[i])
@@ -115,13 +125,15 @@ def test_uniform_leaves_are_a_grid_of_nearest_nodes(variant_rgb: str) -> None:
 def test_derivatives_are_those_of_the_twin(variant_rgb: str, colours: str) -> None:
     tree, (o, d) = random_octree(5, split=0.55, colours=colours), hard_rays()
     rays, by = bundle(o, d), ([0.3, -0.5, 0.9], 0.7)
-    index, source = LeafIndex.find(tree), make_leaf_harmonics(tree, rays.d, slope=True)
+    index, source = LeafIndex.find(tree), leaves_along(tree, d, slope=True)
     rendered = render_leaves(index, source, rays)
     dr.eval(rendered)
     vjp_leaves(index, source, rendered, RayGradient(mi.Color3f(*by[0]), mi.Float(by[1])))
-    by_density, by_rows = (np.array(s) for s in source.slopes())
-    slopes = by_density, by_rows.reshape(tree.leaves, tree.width)[:, : 3 * tree.basis].reshape(tree.leaves, tree.basis, 3)
     basis, values = basis_of(tree, d), [np.float64(v) for v in tree.values()]
+    by_table, table = (np.array(t, np.float64).reshape(len(d), tree.leaves, 4) for t in (source.slope, source.table))
+    shown = table[..., 1:]
+    by_sums = by_table[..., 1:] * (shown > 0 if colours == "clamp" else shown * (1 - shown))
+    slopes = by_table[..., 0].sum(axis=0), np.einsum("rb,rlc->lbc", basis, by_sums)
     rng = np.random.default_rng(5)
     for which in (0, 1):
         move = rng.normal(size=slopes[which].shape)
@@ -135,8 +147,9 @@ def test_derivatives_are_those_of_the_twin(variant_rgb: str, colours: str) -> No
         assert abs(terms.sum() - (ends[1] - ends[0]) / 2e-6) <= 2e-5 * np.sqrt(np.sum(terms**2)) + 2e-4
 
 
-def test_derivatives_through_the_table_of_a_pinhole(variant_rgb: str) -> None:
-    tree = random_octree(4, split=0.6)
+@pytest.mark.parametrize("colours", ["clamp", "sigmoid"])
+def test_derivatives_through_the_table_of_a_pinhole(variant_rgb: str, colours: str) -> None:
+    tree = random_octree(4, split=0.6, colours=colours)
     points = np.array([[0.2, -4.0, 0.3], [3.0, 1.0, 0.5]])
     rng = np.random.default_rng(6)
     slot = np.arange(24) % 2
@@ -169,7 +182,7 @@ def test_derivatives_through_the_table_of_a_pinhole(variant_rgb: str) -> None:
 def test_weights_are_the_largest_of_all_rays(variant_rgb: str) -> None:
     tree, (o, d) = random_octree(4, split=0.6), hard_rays()
     index, weight = LeafIndex.find(tree), dr.zeros(mi.Float, tree.leaves)
-    raise_leaf_weights(index, make_leaf_harmonics(tree, bundle(o, d).d), bundle(o, d), weight)
+    raise_leaf_weights(index, leaves_along(tree, d), bundle(o, d), weight)
     density, sh = (np.float64(v) for v in tree.values())
     largest, basis = np.zeros(tree.leaves), basis_of(tree, d)
     for leaf in np.flatnonzero(np.array(weight) > 0.05)[:10]:

@@ -2,9 +2,8 @@ r"""Emission-absorption rendering of an octree along rays, exact for its constan
 
 .. math:: L = \sum_i T_i (1 - e^{-\tau_i})\, c_i, \qquad T_{i+1} = T_i e^{-\tau_i}, \qquad \tau_i = \sigma_i\, \Delta_i
 
-Conventions. A source reads the extinction and the colour of a leaf. :class:`LeafColours` serves rays from pinholes: a table of
-four numbers a leaf and pinhole, seen in the direction from the pinhole to the middle of the leaf. :class:`LeafHarmonics` sums
-the harmonics in the direction of the ray, at each leaf.
+Conventions. Rays start at pinholes. A source reads the extinction and the colour of a leaf from a table of four numbers a leaf
+and pinhole. The colour is that of the direction from the pinhole to the middle of the leaf.
 
 Derivatives. Rays are walked back from their last leaf. Let r be the light from behind a leaf, times the derivative of the loss
 by this light, as if the leaf began at the eye: r <- (1 - e^-tau) s + e^-tau r, with s = <dL, c>. The derivative by tau is
@@ -31,11 +30,9 @@ from mivol.transport.traversal.octree_walk import VisitedLeaf, clip_to_octree, r
 __all__ = [
     "HalfColours",
     "LeafColours",
-    "LeafHarmonics",
     "LeafPlaces",
     "LeafRays",
     "make_leaf_colours",
-    "make_leaf_harmonics",
     "raise_leaf_weights",
     "render_leaves",
     "vjp_leaf_colours",
@@ -99,68 +96,10 @@ class HalfColours:
         return mi.Float(values[0]) * dr.opaque(mi.Float, 1 / self.cell), [mi.Float(values[k]) for k in (1, 2, 3)]
 
 
-@dataclass
-class LeafHarmonics:
-    """Harmonics and extinction of leaves side by side, summed in the direction of the ray.
-
-    Attributes:
-        tree: octree.
-        table: Float, harmonics and extinction of each leaf, ``width`` numbers.
-        basis: harmonics of each lane's direction.
-        slope: derivative in the layout of ``table``; None without derivatives.
-    """
-
-    tree: Octree
-    table: mi.Float
-    basis: list[mi.Float]
-    slope: mi.Float | None
-
-    @property
-    def width(self) -> int:
-        """Size of a row of the table."""
-        return _packed_width(self.tree)
-
-    def read(self, row: mi.UInt32, on: mi.Bool) -> tuple[mi.Float, list[mi.Float]]:
-        """Extinction and colour of leaves."""
-        values = dr.gather(mi.ArrayXf, self.table, row, on, shape=(self.width, 1))
-        return values[3 * self.tree.basis], self.tree.map_colours(sum_harmonics(values, self.basis, self.tree.offset))
-
-    def add(self, row: mi.UInt32, by_sigma: mi.Float, by_colour: list[mi.Float], on: mi.Bool) -> None:
-        """Add derivatives by the values of the leaves."""
-        _, colour = self.read(row, on)
-        by_sum = [d * s for d, s in zip(by_colour, self.tree.colour_slopes(colour), strict=True)]
-        values = [*(c * y for y in self.basis for c in by_sum), by_sigma]
-        add_packet(self.slope, [*values, *(mi.Float(0) for _ in range(self.width - len(values)))], row, on)
-
-    def slopes(self) -> tuple[mi.Float, mi.Float]:
-        """Derivatives by ``density`` and ``harmonics`` of the octree."""
-        tree, every, many = self.tree, dr.arange(mi.UInt32, self.tree.leaves), 3 * self.tree.basis
-        row = dr.gather(mi.ArrayXf, self.slope, every, shape=(self.width, 1))
-        harmonics = dr.zeros(mi.Float, tree.leaves * tree.width)
-        padded = [*(row[k] for k in range(many)), *(mi.Float(0) for _ in range(tree.width - many))]
-        dr.scatter(harmonics, mi.ArrayXf(padded), every)
-        return +row[many], harmonics
-
-
-LeafSource = LeafColours | HalfColours | LeafHarmonics
-
-
-def _packed_width(tree: Octree) -> int:
-    """Size of a row of harmonics and extinction, padded to whole packets."""
-    return -(-(3 * tree.basis + 1) // 4) * 4
+LeafSource = LeafColours | HalfColours
 
 
 # -- Sources ---------------------------------------------------------------------------------------------------------------
-
-
-def make_leaf_harmonics(tree: Octree, d: mi.Vector3f, slope: bool = False) -> LeafHarmonics:
-    """The source for rays of any unit world directions; ``slope`` makes room for derivatives."""
-    width, every = _packed_width(tree), dr.arange(mi.UInt32, tree.leaves)
-    table = dr.zeros(mi.Float, width * tree.leaves)
-    row = dr.gather(mi.ArrayXf, tree.harmonics, every, shape=(tree.width, 1))
-    values = [*(row[k] for k in range(3 * tree.basis)), dr.gather(mi.Float, tree.density, every)]
-    dr.scatter(table, mi.ArrayXf([*values, *(mi.Float(0) for _ in range(width - len(values)))]), every)
-    return LeafHarmonics(tree, table, tree.eval_basis(d), dr.zeros(mi.Float, dr.width(table)) if slope else None)
 
 
 @dataclass
