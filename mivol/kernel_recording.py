@@ -180,12 +180,11 @@ class RecordedFunctions:
     arrays, since a recording holds sizes as numbers. A function that Dr.Jit cannot record is run, and :meth:`describe_failure`
     says so.
 
-    Args:
-        most: largest number of recordings; the least recently used is dropped.
+    The least recently used of more than eight recordings is dropped.
     """
 
-    def __init__(self, most: int = 8) -> None:
-        self._recordings = Recordings(most, keeps_literals=False)
+    def __init__(self) -> None:
+        self._recordings = Recordings(8, keeps_literals=False)
         self._failure = ""
 
     @property

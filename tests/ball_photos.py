@@ -10,7 +10,7 @@ from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import RadiancePlan, RadianceStage
 from mivol.optim.photographs.radiance_problem import RadianceProblem
-from mivol.optim.photographs.ray_batches import RayBatches
+from mivol.optim.photographs.ray_batches import RayBatch, RayBatches
 from mivol.photos import Camera, Photo
 from mivol.photos.camera import intrinsics
 
@@ -60,3 +60,8 @@ def fitted(batches: RayBatches, plan: RadiancePlan, steps: int | None = None, fi
         fit.advance()
     fit.problem.set_reals(fit.run.reals)
     return fit
+
+
+def draw_tiles(batches: RayBatches, shrink: int, views: np.ndarray, tiles: int, rng: np.random.Generator) -> RayBatch:
+    """The rays of ``tiles`` tiles of each of some views."""
+    return batches.make_tiles(shrink, views, batches.draw_corners(shrink, views, tiles, rng))

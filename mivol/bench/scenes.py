@@ -252,24 +252,16 @@ def sun_and_sky(height: int = 128) -> dict:
     return _environment(image) | {"phase": {"type": "hg", "g": 0.8}}
 
 
-def sun_before_the_camera(height: int = 128) -> dict:
-    """A sun of 4 degrees' radius, 35 degrees off the axis of the camera, in a nearly black sky; HG g = 0.8.
-
-    Args:
-        height: height of the environment map [pixels].
-    """
-    d = map_directions(height)
+def sun_before_the_camera() -> dict:
+    """A sun of 4 degrees' radius, 35 degrees off the axis of the camera, in a nearly black sky; HG g = 0.8."""
+    d = map_directions(128)
     sun = d @ np.array([-0.253, 0.778, 0.574]) > math.cos(math.radians(4.0))
     return _environment(np.where(sun[..., None], np.array([105.0, 97.0, 82.0]), 0.01)) | {"phase": {"type": "hg", "g": 0.8}}
 
 
-def glass_under_a_sky(height: int = 16) -> dict:
-    """A box of smooth glass under a sky that brightens upwards, isotropic scattering.
-
-    Args:
-        height: height of the environment map [pixels].
-    """
-    image = (1 + 0.5 * map_directions(height)[..., 2:]) * np.array([0.8, 1.0, 1.2])
+def glass_under_a_sky() -> dict:
+    """A box of smooth glass under a sky that brightens upwards, isotropic scattering."""
+    image = (1 + 0.5 * map_directions(16)[..., 2:]) * np.array([0.8, 1.0, 1.2])
     return _environment(image) | {"phase": {"type": "isotropic"}, "bsdf": {"type": "dielectric"}}
 
 

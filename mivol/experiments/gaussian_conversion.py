@@ -136,17 +136,16 @@ def read_as_gaussians(source: Path) -> Gaussians:
     return read_gaussians(source) if is_gaussian_file(source) else points_to_gaussians(read_points(source))
 
 
-def field_psnr(cloud: Gaussians, field: SphericalGrid, edge: int = EDGE) -> float:
+def field_psnr(cloud: Gaussians, field: SphericalGrid) -> float:
     """PSNR between views of a field and splatted Gaussians [dB]: code values over black, peak 1.
 
     Args:
         cloud: source of the field, or Gaussians made from the field.
         field: single-level field, in code values.
-        edge: edge of a view [pixel].
     """
-    splatter, reals = Splatter(edge, edge, cloud.degree), to_tensors(cloud)
+    splatter, reals = Splatter(EDGE, EDGE, cloud.degree), to_tensors(cloud)
     truth, images = [], []
-    for camera in cameras_around(field.to_world, edge):
+    for camera in cameras_around(field.to_world, EDGE):
         truth.append(np.array(splatter.forward(reals, camera, derivatives=False)[0])[..., :3])
         images.append(render_view(field, camera, np.zeros(3)).image)
     return psnr(np.stack(images), np.stack(truth), 1.0)
@@ -317,18 +316,17 @@ class MeshLoss:
     invented: float
 
 
-def measure_mesh_error(cloud: Gaussians, mesh: Mesh, low: np.ndarray, high: np.ndarray, edge: int = EDGE) -> MeshLoss:
+def measure_mesh_error(cloud: Gaussians, mesh: Mesh, low: np.ndarray, high: np.ndarray) -> MeshLoss:
     """Compare a mesh with splatted views, ray by ray.
 
     Args:
         cloud: Gaussians from which the mesh was made.
         mesh: mesh in the same world.
         low, high: corners (3,) of the box in the views.
-        edge: edge of a view [pixel].
     """
     scene = mi.load_dict({"type": "scene", "mesh": _shape_of(mesh)})
     distances, missed, invented = [], [], []
-    for view in _splat_depths(cloud, cameras_around(box_to_world(low, high), edge)):
+    for view in _splat_depths(cloud, cameras_around(box_to_world(low, high), EDGE)):
         mesh_depth = _depth_in(scene, view.camera)
         is_opaque = np.isfinite(view.depth)
         both = is_opaque & np.isfinite(mesh_depth)

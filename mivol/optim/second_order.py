@@ -42,12 +42,12 @@ class Packing:
         flat = [np.asarray(tensors[name]).ravel().astype(np.float64) * lr**power for name, lr, _ in self.parts]
         return np.concatenate(flat)
 
-    def tensors(self, vector: np.ndarray, power: int = 1) -> Reals:
-        """Tensors of a vector; ``power`` +1 for points, -1 for gradients."""
+    def tensors(self, vector: np.ndarray) -> Reals:
+        """Tensors of the vector of a point."""
         parts, start = {}, 0
         for name, lr, shape in self.parts:
             size = int(np.prod(shape))
-            part = vector[start : start + size] * lr**power
+            part = vector[start : start + size] * lr
             parts[name] = mi.TensorXf(part.astype(np.float32).reshape(shape))
             start += size
         return parts

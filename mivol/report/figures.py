@@ -120,21 +120,18 @@ def _escape(text: str) -> str:
     return text.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
 
 
-def plot_curve(
-    rows: Sequence[dict], name: str, *, against: str = "iteration", units: Mapping[str, str] | None = None
-) -> Figure:
-    """Plot one quantity of ``metrics.jsonl`` against iterations or seconds, with the last value at the end of the curve.
+def plot_curve(rows: Sequence[dict], name: str, *, units: Mapping[str, str] | None = None) -> Figure:
+    """Plot one quantity of ``metrics.jsonl`` against iterations, with the last value at the end of the curve.
 
     Args:
         rows: rows of :func:`mivol.report.record.read_metrics`; rows without the quantity are skipped.
         name: key of the quantity.
-        against: ``iteration`` or ``seconds``.
         units: units of the run (:class:`mivol.report.record.RunRecord`).
 
     Raises:
         MivolError: no row has the quantity.
     """
-    points = [(row[against], row[name]) for row in rows if row.get(name) is not None and row.get(against) is not None]
+    points = [(row["iteration"], row[name]) for row in rows if row.get(name) is not None and row.get("iteration") is not None]
     if not points:
         raise MivolError(f'no row of the metrics has "{name[:80]}"; choose a recorded quantity.')
     x, y = np.array(points, float).T
@@ -144,10 +141,10 @@ def plot_curve(
         axes = figure.subplots()
         axes.plot(x, y, color=SERIES[0], marker="o" if len(x) <= 30 else None, markersize=3.5, clip_on=False)
         axes.set_title(quantity.label + (f" [{quantity.unit}]" if quantity.unit else ""))
-        axes.set_xlabel("time [s]" if against == "seconds" else "iteration")
+        axes.set_xlabel("iteration")
         if quantity.log and (y > 0).all():
             _log_axis(axes.yaxis, y)
-        axes.xaxis.set_major_locator(MaxNLocator(6, integer=against == "iteration"))
+        axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         end = {"ha": "left", "va": "center", "color": SERIES[0], "weight": "bold", "fontsize": 9.5}
         axes.annotate(f"{y[-1]:.3g}", (x[-1], y[-1]), (6, 0), textcoords="offset points", **end)
         if name in LEVELS:

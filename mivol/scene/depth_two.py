@@ -157,20 +157,23 @@ def _sample_cosine(normal: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarr
     return np.where(length > 1e-12, d / np.maximum(length, 1e-12), normal)
 
 
-def scattering_depth(view: MediumView, box: Box, n: int = 1 << 14, scene: mi.Scene | None = None) -> float:
+LINES = 1 << 14
+"""Number of lines through a medium, the same in each call."""
+
+
+def scattering_depth(view: MediumView, box: Box, scene: mi.Scene | None = None) -> float:
     """Optical depth of a medium, weighted by scattered light: E[tau^2] / E[tau] over all lines through the medium.
 
     Args:
         view: the medium.
         box: its boundary, or a box around the medium; lines that miss the medium count in neither mean.
-        n: number of lines; all calls use the same lines.
         scene: the scene, for a traced boundary.
 
     Returns:
         Optical depth [1] of the densest channel; 0 for an empty medium. Standard error: 0.3 % for a cube, 0.7 % for the
             tutorial's smoke.
     """
-    o, d, length = sample_lines(box, n)
+    o, d, length = sample_lines(box, LINES)
     origin, direction = (kind(np.ascontiguousarray(x.T, np.float32)) for kind, x in ((mi.Point3f, o), (mi.Vector3f, d)))
     with dr.suspend_grad():
         if scene is not None:

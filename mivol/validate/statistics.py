@@ -76,15 +76,6 @@ class Moments:
         mean = self.mean + (x - self.mean) / n
         return Moments(n, mean, self.m2 + (x - self.mean) * (x - mean))
 
-    def merge(self, other: Moments) -> Moments:
-        """Add all values of another set (Chan, Golub, LeVeque)."""
-        n = self.n + other.n
-        if n == 0:
-            return self
-        delta = other.mean - self.mean
-        mean = self.mean + delta * (other.n / n)
-        return Moments(n, mean, self.m2 + other.m2 + delta**2 * (self.n * other.n / n))
-
     @property
     def variance(self) -> np.ndarray:
         """Unbiased variance of a single value, M/(n - 1).

@@ -189,10 +189,10 @@ class GaussianSubject(Subject):
 
     can_crop = True
 
-    def __init__(self, path: Path, look: PointLook | None = None) -> None:
+    def __init__(self, path: Path) -> None:
         is_cloud = not is_gaussian_file(check_file(path))
         cloud = read_points(path) if is_cloud else None
-        self._begin(path.stem, read_gaussians(path) if cloud is None else gaussians_for(cloud, look or PointLook()), cloud)
+        self._begin(path.stem, read_gaussians(path) if cloud is None else gaussians_for(cloud, PointLook()), cloud)
         self.home = None if is_cloud else read_gaussian_view(path)
 
     @classmethod

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from ball_photos import draw_tiles
 from emission_scenes import changes, colours, gradients
 from oracle import box_interval
 from oracle_radiance import Twin
@@ -401,7 +402,7 @@ def test_photographs_of_different_sizes_without_jitter() -> None:
         photos.append(Photo("noise", codes[..., :3], codes[..., 3], None, camera, np.ones(3)))
     views = RayBatches.from_photos(photos)
     order = np.array([2, 0, 1])
-    batches = [views.draw_tiles(1, order, 30, np.random.default_rng(seed)) for seed in range(2)]
+    batches = [draw_tiles(views, 1, order, 30, np.random.default_rng(seed)) for seed in range(2)]
     for batch in batches:
         d, slot = np.array(batch.rays.d).T, np.array(batch.slot)
         target = np.concatenate([np.array(batch.target).T, np.array(batch.alpha)[:, None]], axis=1)

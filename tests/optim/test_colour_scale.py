@@ -7,7 +7,7 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
-from ball_photos import BOX, CUBE, PLAN, camera, fitted
+from ball_photos import BOX, CUBE, PLAN, camera, draw_tiles, fitted
 
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.photographs.field_view import render_view
@@ -88,7 +88,7 @@ def test_errors_are_weighted_by_the_slope_of_the_tone_curve(variant_rgb: str) ->
     """The loss of a ray, in float64, from what the field shows and the photographs hold; of a photograph beyond 1, too."""
     photos = [shot(k, 16) for k in range(3)]
     problem = problem_of(photos)
-    batch = problem.batches.draw_tiles(1, np.array([0, 2]), 6, np.random.default_rng(2))
+    batch = draw_tiles(problem.batches, 1, np.array([0, 2]), 6, np.random.default_rng(2))
     target = np.array(batch.target, np.float64).T
     assert target.max() > 3
     loss, slopes = problem.batch_loss_and_gradient(batch)

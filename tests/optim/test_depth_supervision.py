@@ -7,7 +7,7 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
-from ball_photos import BOX, PLAN, fitted
+from ball_photos import BOX, PLAN, draw_tiles, fitted
 
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import (
@@ -79,7 +79,7 @@ def differentiate_depths(sighted: list[Photo]) -> tuple[RadianceProblem, DepthRa
     """A fit in an even fog, rays to points, and 0.7 times the derivative of their energy by the numbers of the fit."""
     problem = RadianceProblem(RayBatches.from_photos(sighted, (1, 2)), BOX, replace(PLAN, depth=0.7))
     chosen = np.arange(4)
-    batch = problem.batches.draw_tiles(2, chosen, 4, np.random.default_rng(0))
+    batch = draw_tiles(problem.batches, 2, chosen, 4, np.random.default_rng(0))
     drawn = problem._draw_depth_rays(chosen, 3)
     with_points, without = (problem.batch_loss_and_gradient(batch, None, points)[1] for points in (drawn, None))
     return problem, drawn, {name: np.array(with_points[name], np.float64) - np.array(without[name]) for name in without}

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from ball_photos import BOX, PLAN
+from ball_photos import BOX, PLAN, draw_tiles
 
 from mivol import config
 from mivol.errors import MivolError
@@ -64,7 +64,7 @@ def test_gain_gradient_matches_the_squared_error(variant_rgb: str) -> None:
     """(g s - t)^2, mean over rays and rgb, differentiated by log g in float64 from what the field shows."""
     problem, logs = problem_of(), logs_of(5, 0.2)
     problem.exposure = Exposure(mi.Float(logs.ravel()))
-    batch = problem.batches.draw_tiles(1, np.array([0, 2, 3]), 5, np.random.default_rng(2))
+    batch = draw_tiles(problem.batches, 1, np.array([0, 2, 3]), 5, np.random.default_rng(2))
     loss, slopes = problem.batch_loss_and_gradient(batch)
     source = bake(problem.field, problem._cells, batch.origins, batch.slot)
     seen = render_rays(problem._cells, source, make_model(problem.field, problem.plan.stop), batch.rays)
@@ -83,7 +83,7 @@ def test_gain_gradient_matches_the_squared_error(variant_rgb: str) -> None:
 def test_gain_cancels_the_exposure_of_a_brighter_photograph(variant_rgb: str) -> None:
     """Targets and gains times g: errors are g times as large, and derivatives by the field and the sky g^2 times."""
     problem, gain = problem_of(), 1.7
-    batch = problem.batches.draw_tiles(1, np.array([1, 4]), 6, np.random.default_rng(4))
+    batch = draw_tiles(problem.batches, 1, np.array([1, 4]), 6, np.random.default_rng(4))
     _, before = problem.batch_loss_and_gradient(batch)
     problem.exposure = Exposure(dr.full(mi.Float, np.log(gain), 15))
     _, after = problem.batch_loss_and_gradient(replace(batch, target=batch.target * gain))
@@ -109,7 +109,7 @@ def test_gains_of_equal_exposures_are_removed(variant_rgb: str, spread: float, s
     assert (said or "photographs differ in exposure by 4%, so each has gains") in refinement.message
     assert problem.has_gains != bool(said)
     np.testing.assert_array_equal(np.array(refinement.reals["exposure"]), 0 * logs if said else logs)
-    batch = problem.batches.draw_tiles(1, np.array([0, 2]), 5, np.random.default_rng(2))
+    batch = draw_tiles(problem.batches, 1, np.array([0, 2]), 5, np.random.default_rng(2))
     slopes = np.array(problem.batch_loss_and_gradient(batch)[1]["exposure"])
     assert slopes.shape == (15,) and slopes.any() != bool(said)
     reals = problem.values() | {"exposure": mi.TensorXf(logs)}

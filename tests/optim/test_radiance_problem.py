@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from ball_photos import BOX, PLAN, WHITE, ball, camera, error_of, fitted
+from ball_photos import BOX, PLAN, WHITE, ball, camera, draw_tiles, error_of, fitted
 from refusals import assert_refused
 from scipy.ndimage import maximum_filter
 
@@ -195,7 +195,7 @@ def test_the_vacuum_around_a_sparse_field_stays_empty(variant_rgb: str, photos: 
     middle[3:9, 3:9, 3:9] = True
     problem.field = problem.field.select_nodes(middle)
     problem.update_occupancy()
-    batch = problem.batches.draw_tiles(2, np.arange(3), 30, np.random.default_rng(3))
+    batch = draw_tiles(problem.batches, 2, np.arange(3), 30, np.random.default_rng(3))
     _, slopes = problem.batch_loss_and_gradient(batch)
     density = np.array(slopes["density"])
     harmonics = np.array(slopes["harmonics"]).reshape(len(density), -1)
@@ -217,7 +217,7 @@ def test_changing_backgrounds_leave_no_white_matter(variant_rgb: str, photos: li
 def slopes_of(photos: list[Photo], shrink: int = 2, background: np.ndarray | None = None) -> list[np.ndarray]:
     """Squared errors and derivatives of the first step of a fog."""
     problem, chosen = RadianceProblem(RayBatches.from_photos(photos, (1, 2)), BOX, PLAN), np.arange(len(photos))
-    batch = problem.batches.draw_tiles(shrink, chosen, 30, np.random.default_rng(3))
+    batch = draw_tiles(problem.batches, shrink, chosen, 30, np.random.default_rng(3))
     loss, slopes = problem.batch_loss_and_gradient(batch, background)
     return [np.array(a) for a in (loss, *slopes.values())]
 
@@ -300,7 +300,7 @@ def test_beta_favours_opacities_of_0_or_1(variant_rgb: str, photos: list[Photo])
     """The beta prior's part of the derivatives is that of the mean of log T + log(1 - T) over the rays."""
     batches, parts = RayBatches.from_photos(photos[:3], (1, 2)), {}
     problem = RadianceProblem(batches, BOX, replace(PLAN, start=1.0))  # a fog: no density is at the ReLU's kink
-    batch = batches.draw_tiles(2, np.arange(3), 30, np.random.default_rng(3))
+    batch = draw_tiles(batches, 2, np.arange(3), 30, np.random.default_rng(3))
     for beta in (0.0, 0.5):
         problem.plan = replace(PLAN, beta=beta)
         parts[beta] = np.array(problem.batch_loss_and_gradient(batch, np.ones(3))[1]["density"], np.float64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 import pytest
+from ball_photos import draw_tiles
 
 from mivol.errors import MivolError
 from mivol.optim.photographs.field_view import CameraRays
@@ -15,7 +16,7 @@ from mivol.photos.lens import Fisheye, Lens
 
 def test_batches_have_rays_and_pixels_of_their_views(variant_rgb: str, photos: list[Photo]) -> None:
     views = RayBatches.from_photos(photos[:3], (1, 2))
-    batch = views.draw_tiles(1, np.array([0, 2]), 5, np.random.default_rng(0))
+    batch = draw_tiles(views, 1, np.array([0, 2]), 5, np.random.default_rng(0))
     assert dr.width(batch.slot) == 2 * 5 * TILE**2
     whole = views.all_pixels(1, 1)
     _, d = rays(photos[1].camera, pixel_centres((48, 48)))
@@ -48,7 +49,7 @@ def test_smallest_view_is_a_tile(variant_rgb: str) -> None:
     """A view of one tile is taken as it is; at half its size it is refused, with the way out."""
     camera = Camera(intrinsics(10, 10, TILE / 2, TILE / 2), (TILE, TILE), np.eye(4))
     photo = Photo("a", np.full((TILE, TILE, 3), 0.5, np.float32), None, None, camera, np.zeros(3, np.float32))
-    batch = RayBatches.from_photos([photo]).draw_tiles(1, np.array([0]), 1, np.random.default_rng(0))
+    batch = draw_tiles(RayBatches.from_photos([photo]), 1, np.array([0]), 1, np.random.default_rng(0))
     np.testing.assert_allclose(np.array(batch.target), 0.5, atol=0.5 / 255 + 1e-6)
     with pytest.raises(MivolError, match=f"found a view of {TILE // 2} pixels an edge at 1/2, expected at least {TILE}"):
         RayBatches.from_photos([photo], (1, 2))

@@ -37,7 +37,7 @@ def falling_curve() -> Figure:
 
 
 def long_curve() -> Figure:
-    return plot_curve([{"iteration": k, "seconds": 0.5 * k, "psnr": 20.0 + k} for k in range(31)], "psnr", against="seconds")
+    return plot_curve([{"iteration": k, "seconds": 0.5 * k, "psnr": 20.0 + k} for k in range(31)], "psnr")
 
 
 def reaching_the_noise() -> Figure:
@@ -109,7 +109,7 @@ def test_a_figure_is_readable(draw: Callable[[], Figure]) -> None:
     ("draw", "title", "x", "scales"),
     [
         (falling_curve, "Loss", "iteration", ("linear", "log")),
-        (long_curve, "PSNR of the fitted views [dB]", "time [s]", ("linear", "linear")),
+        (long_curve, "PSNR of the fitted views [dB]", "iteration", ("linear", "linear")),
         (reaching_the_noise, "RMS of residual over noise (noise level: 1)", "iteration", ("linear", "log")),
         (profile, "sigma_t [1/length]", "y [length]", ("linear", "linear")),
         (methods, "Which is sooner?", "time of a call after the first [s]", ("log", "log")),

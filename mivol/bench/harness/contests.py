@@ -315,9 +315,9 @@ class Contest:
         """Results (rounds, ...) in float64."""
         return np.array(self.timings[name, level].results, np.float64)
 
-    def variances(self, name: str, level: int = 1) -> np.ndarray:
-        """Variance of one result, for each number."""
-        return Moments.from_values(self.results(name, level)).variance
+    def variances(self, name: str) -> np.ndarray:
+        """Variance of one result at the first level, for each number."""
+        return Moments.from_values(self.results(name)).variance
 
     def time_ratios(self, slow: str, fast: str) -> dict[str, float]:
         """Time of one method over the time of another, by the wall clock and by processor time."""

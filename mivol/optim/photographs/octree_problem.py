@@ -277,7 +277,7 @@ class OctreeProblem(SparseProblem, DividedProblem):
             self.grid.take_step_state(state)
 
     def batch_loss_and_gradient(
-        self, batch: RayBatch, background: np.ndarray | None = None, share: float = 1.0
+        self, batch: RayBatch, background: np.ndarray | None, share: float
     ) -> tuple[mi.Float, tuple[mi.Float, mi.Float]]:
         """Squared error of each ray of a batch, weighted, mean over rgb, and derivatives of the mean over rays.
 

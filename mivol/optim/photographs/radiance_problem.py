@@ -266,7 +266,6 @@ class RadianceProblem(SparseProblem, DividedProblem):
         batch: RayBatch,
         background: np.ndarray | None = None,
         depth_rays: DepthRays | None = None,
-        share: float = 1.0,
     ) -> tuple[mi.Float, dict[str, mi.Float]]:
         """Squared error of each ray of a batch, weighted, mean over rgb, and derivatives of the mean over rays, by parameter.
 
@@ -274,9 +273,8 @@ class RadianceProblem(SparseProblem, DividedProblem):
             batch: rays and their target colours.
             background: put behind all photographs (3,); None keeps each photograph's own background.
             depth_rays: points of the same views; only the derivatives contain the plan's weight times their energy.
-            share: of the batch in a step, a factor on the derivatives of rays.
         """
-        settings, colour = self._gradient_settings(share), _opaque_colour(background)
+        settings, colour = self._gradient_settings(1.0), _opaque_colour(background)
         return differentiate_batch(settings, self._field_model(), batch, colour, depth_rays)
 
     # -- Steps --------------------------------------------------------------------------------------------------------

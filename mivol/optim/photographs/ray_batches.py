@@ -274,10 +274,6 @@ class RayBatches:
         n = len(self.origins)
         return np.sort(rng.choice(n, min(count, n), replace=False))
 
-    def draw_tiles(self, shrink: int, views: np.ndarray, tiles: int, rng: np.random.Generator) -> RayBatch:
-        """Draw ``tiles`` tiles of each of some views; rays of a view are adjacent."""
-        return self.make_tiles(shrink, views, self.draw_corners(shrink, views, tiles, rng))
-
     def draw_corners(self, shrink: int, views: np.ndarray, tiles: int, rng: np.random.Generator) -> np.ndarray:
         """Draw the first pixels (column, row) of tiles of each of some views: (views, tiles, 2)."""
         corners = self.levels[shrink].sizes[views] - TILE + 1
@@ -287,7 +283,7 @@ class RayBatches:
         return np.take_along_axis(corner, order[..., None], axis=1)
 
     def make_tiles(self, shrink: int, views: np.ndarray, corner: np.ndarray) -> RayBatch:
-        """Rays of the tiles of :meth:`draw_corners`."""
+        """Rays of the tiles of :meth:`draw_corners`; rays of a view are adjacent."""
         return self.tabulate(shrink, views, corner).make_tiles(self.origins[views])
 
     def tabulate(self, shrink: int, views: np.ndarray, corner: np.ndarray) -> PixelTable:

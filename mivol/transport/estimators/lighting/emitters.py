@@ -236,10 +236,10 @@ class _EmitterTable:
         return x, y, z, r, finite > 0
 
 
-def join_arrays(values: list[mi.Float] | list[mi.UInt32], at_once: int = 16) -> mi.Float | mi.UInt32:
-    """Join arrays, few at once: a kernel with hundreds of inputs would take a second to compile."""
+def join_arrays(values: list[mi.Float] | list[mi.UInt32]) -> mi.Float | mi.UInt32:
+    """Join arrays, sixteen at once: a kernel with hundreds of inputs would take a second to compile."""
     while len(values) > 1:
-        values = [dr.concat(values[k : k + at_once]) for k in range(0, len(values), at_once)]
+        values = [dr.concat(values[k : k + 16]) for k in range(0, len(values), 16)]
         dr.eval(values)
     return values[0]
 
