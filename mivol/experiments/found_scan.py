@@ -421,6 +421,11 @@ def _draft_tiff(path: Path, given: dict[str, Any]) -> ScanDraft:
         reading, why = guess_reading(path, images["views"][0])
         data |= reading
         lines.append(f"assumed: no flats, and {why}: the pixels are taken as {data['reading']}s; data.reading sets it")
+    if missing := missing_numbers(chosen["views"].files):
+        lines.append(
+            f"found: no view with the number {', '.join(map(str, missing))}: if views were lost there, the others are not "
+            "spread evenly, and data.angles has to name a file of their angles"
+        )
     lines.append(FIRST_ROW)
     data["first_row"] = "highest"
     scan: dict[str, Any] = {"beam": "parallel"}
@@ -436,6 +441,15 @@ def _draft_tiff(path: Path, given: dict[str, Any]) -> ScanDraft:
         )
     raw = {"scan": scan, "data": data}
     return _finish(raw, [*lines, *_put_grid(raw, rows, columns)], counts["views"])
+
+
+def missing_numbers(files: list[Path]) -> list[int]:
+    """Numbers between those in the names of files, whose last number counts by ones; empty if a tenth or more is missing."""
+    numbers = {int(found[-1]) for file in files if (found := re.findall(r"\d+", file.stem))}
+    if len(numbers) < len(files):
+        return []
+    missing = sorted(set(range(min(numbers), max(numbers) + 1)) - numbers) if numbers else []
+    return missing if 10 * len(missing) < len(files) else []
 
 
 def _groups_beside(path: Path) -> list[ImageGroup]:
@@ -478,6 +492,7 @@ def _draft_angles(folder: Path, scan: dict[str, Any], data: dict[str, Any], view
         try:
             angles = read_columns(file, 1)[:, 0]
         except MivolError:
+            others.append(f"{file.name} is not one column of numbers")
             continue
         if len(angles) == views:
             unit = "radian" if half_turns_in_radians(angles) else "degree"

@@ -31,6 +31,7 @@ from mivol.tomography.preprocess import (
     Transmission,
     count_quanta,
     find_air,
+    find_lost_views,
     fit_air,
     interpolate_gaps,
     normalise_air,
@@ -248,12 +249,13 @@ def read_measured(settings: config.ScanExperiment, base: Path, rows: slice = ALL
         notes += note_order(angles)
     # Scattered light brightens the air: it is not looked for before the scatter is known.
     columns = 0 if data.air is None and data.scatter and not data.hardening else data.air
-    transmission, light, air_notes = correct_air(readings.transmission, columns, air)
-    pictures = [] if light is None else [show_step("air", readings.transmission.value, transmission.value)]
+    given, lost_notes = leave_out_lost_views(readings.transmission)
+    transmission, light, air_notes = correct_air(given, columns, air)
+    pictures = [] if light is None else [show_step("air", given.value, transmission.value)]
     if readings.intensity is not None:
         check_light(transmission)
     transmission, corrections, shown = correct_pixels(data, transmission)
-    notes += [*air_notes, *corrections]
+    notes += [*lost_notes, *air_notes, *corrections]
     measured, weights = to_line_integrals(transmission)
     y, ring_notes = correct_rings(measured, weights, data)
     notes += ring_notes
@@ -289,6 +291,19 @@ def read_measured(settings: config.ScanExperiment, base: Path, rows: slice = ALL
         removed_rings=removed,
         pictures=tuple(pictures),
     )
+
+
+def leave_out_lost_views(transmission: Transmission) -> tuple[Transmission, list[str]]:
+    """Take the readings of spoiled views away, and say so; a scan of such views alone stays as it is."""
+    notes, lost = [], np.zeros(len(transmission.value), bool)
+    for found, why in zip(find_lost_views(transmission), ("without light", "brighter than any view can be"), strict=True):
+        lost |= found
+        if numbers := np.flatnonzero(found).tolist():
+            named = ", ".join(map(str, numbers[:8])) + ", ..." * (len(numbers) > 8)
+            notes.append(f"{len(numbers)} of {len(lost)} views are not used, because they are {why}: {named} (counted from 0)")
+    if not lost.any() or lost.all():
+        return transmission, []
+    return replace(transmission, value=np.where(lost[:, None, None], np.nan, transmission.value)), notes
 
 
 def check_light(transmission: Transmission) -> None:
@@ -402,13 +417,26 @@ def correct_air(
     """
     if columns:
         return normalise_air(transmission, columns), fit_air(transmission.value, columns), []
-    air = (found or find_air(transmission)) if columns is None else None
+    air = (found or _find_air_of_used_views(transmission)) if columns is None else None
     if air is None or not air.is_needed:
         return transmission, None, [] if air is None or air.is_believed else [_describe_doubtful_air(air)]
     least, most = air.factor.min(), air.factor.max()
     size = f"{most:.4g} +- {air.uncertainty:.2g}" if least == most else f"{least:.4g} to {most:.4g}"
     said = f"the air at both edges of the detector has {size} of the flats' light: views are divided by it (data.air = 0: not)"
     return air.normalise(transmission), air.factor[:, None, None], [said]
+
+
+def _find_air_of_used_views(transmission: Transmission) -> Air | None:
+    """As :func:`mivol.tomography.preprocess.find_air`, without views that have no reading; their factor is the mean."""
+    used = np.isfinite(transmission.value).any((1, 2))
+    if used.all():
+        return find_air(transmission)
+    air = find_air(replace(transmission, value=transmission.value[used], variance=transmission.variance[used]))
+    if air is None:
+        return None
+    factor = np.full(len(used), air.factor.mean())
+    factor[used] = air.factor
+    return replace(air, factor=factor)
 
 
 def _describe_doubtful_air(air: Air) -> str:
@@ -445,6 +473,9 @@ def find_rotation_axis(
     Raises:
         MivolError: as :func:`mivol.tomography.rotation_axis.find_axis`, for a parallel beam.
     """
+    used = weights.any((1, 2))
+    if not used.all():  # a view without readings has no mirror image
+        y, weights, beam = y[used], weights[used], replace(beam, angles=beam.angles[used])
     if isinstance(beam, ParallelBeam):
         axis = find_axis(y, weights, beam.angles)
         offset = axis.offset(y.shape[2], beam.pitch[1]) + beam.detector_offset[1]

@@ -107,6 +107,8 @@ class ScanFit(FitKind):
         self.held_out = held_out_views(self.settings, views)
         self.data, self.alignment = refine_geometry(self.settings, grid, self.data, self.held_out)
         self.kept = fitted_views(self.held_out, views)
+        has_readings = self.data.weights.any((1, 2))
+        self.held_out, self.kept = (part[has_readings[part]] for part in (self.held_out, self.kept))
         for note in self.data.notes:
             say(f"  data      {note}")
         self.record.notes += self.data.notes
@@ -170,6 +172,7 @@ class ScanFit(FitKind):
         if fit.run.stop_reason and fit.next_iteration < last:
             record.notes.append(f"stopped after iteration {fit.next_iteration} of {last}: {fit.run.stop_reason}")
         record.results = {"iterations": float(state.iteration), "residual": state.residual_norm / data_norm(problem)}
+        record.results["views"] = float(len(self.kept))
         record.plan += explain_prior(problem.prior, state)
         if self.data.is_noise_known:
             record.results["discrepancy"] = state.residual_norm / expected_residual_norm(problem, self.settings.solve.name)
@@ -180,7 +183,11 @@ class ScanFit(FitKind):
 
     def write_outputs(self, fit: Fit, run: RunFolder, best: BestIterate) -> None:
         volume = fit.run.state.x.reshape(self.projector.grid.shape)
-        write_outputs(run, self.projector, self.grid, self.data, self.held_out, volume, self.settings.unit)
+        predicted = np.zeros(self.data.y.shape, np.float32)
+        predicted[self.kept] = self.problem.linear_problem.A @ volume
+        if len(self.held_out):
+            predicted[self.held_out] = self.projector.subset(self.held_out) @ volume
+        write_outputs(run, predicted, self.grid, self.data, self.held_out, volume, self.settings.unit)
         if self.alignment is not None:
             moves, found = self.alignment.moves, self.alignment
             save_figure(plot_moves(moves, found.before, found.after), run.path / "moves.png")
@@ -339,7 +346,7 @@ def data_norm(task: LeastSquares | PoissonCounts) -> float:
 
 def write_outputs(
     run: RunFolder,
-    projector: Projector,
+    predicted: np.ndarray,
     grid: VoxelGrid,
     data: Projections,
     held_out: np.ndarray,
@@ -350,15 +357,15 @@ def write_outputs(
 
     Args:
         run: run folder, with the iterations on record.
-        projector: projector of fitted and held-out views.
-        grid: requested voxels; the projector's grid may be finer.
+        predicted: line integrals (views, rows, cols) of ``x``, of fitted and held-out views.
+        grid: requested voxels; those of ``x`` may be finer.
         data: projections.
         held_out: indices of the held-out views.
-        x: reconstruction (Z, Y, X) on the projector's grid.
+        x: reconstruction (Z, Y, X).
         unit: unit of lengths; "": unknown.
     """
     run.make("views", "volumes")
-    predicted, record = projector @ x, run.record
+    record = run.record
     volume = voxel_means(x, grid.shape)
     record.volumes += write_grids(run.path, grid, volume, data.truth, unit)
     record.images += film_of_volume(run, volume[..., None], tuple(float(edge) for edge in grid.extent), "z", "sigma_t")
@@ -373,7 +380,6 @@ def write_outputs(
     record.images += draw_scanner(run.path, data.geometry, grid, held_out)
     draw_steps(run, data, caption)
     run.write_curves()
-    record.results["views"] = float(projector.n_views - len(held_out))
     if data.truth is not None:
         record.results["nrmse"] = nrmse(volume, data.truth)
     if len(held_out):

@@ -134,6 +134,8 @@ UNREAD: dict[str, tuple[Callable[[bytes], bool], str]] = {
         lambda head: head.startswith((b"PK\x03\x04", b"7z\xbc\xaf", b"Rar!")) or head[257:262] == b"ustar",
         "unpack it, and name its folder",
     ),
+    "a file compressed by gzip": (_starts_with(b"\x1f\x8b"), "unpack it (gunzip)"),
+    "a FITS file": (_starts_with(b"SIMPLE  ="), "write its array as .npy (astropy.io.fits) or as TIFF"),
     FILM: (
         lambda head: (head[4:8] == b"ftyp" and head[8:11] != b"hei") or head.startswith((b"\x1aE\xdf\xa3", b"RIFF")),
         "mivol poses FILE finds the cameras of its frames",

@@ -103,7 +103,7 @@ def check_finite(path: str | os.PathLike, stack: np.ndarray) -> None:
             path,
             f"{int(bad.sum())} pixels that are not finite, the first at (view, row, column) = {first}",
             "finite numbers",
-            "replace them by 0: a reading of 0 has weight 0",
+            "replace them by 0, or in line integrals by 99: such pixels have weight 0",
         )
 
 

@@ -266,6 +266,26 @@ AIR_TOLERANCE = 0.01
 """Errors of flats as a share of the light, which no view averages out: of the air between edges, columns and views."""
 
 
+LIT_SHARE = 0.01
+"""Smallest share of pixels with light in a view: of noise alone, .13 % exceed three standard deviations."""
+
+
+def find_lost_views(transmission: Transmission) -> tuple[np.ndarray, np.ndarray]:
+    """Find views that a camera or a shutter spoiled: without light, and brighter in every pixel than any view can be.
+
+    Returns:
+        (views,) whether a view has light in less than ``LIT_SHARE`` of its pixels, and whether its darkest pixels exceed the
+        brightest of the other views by the factor of ``AIR_RANGE``. Up to 16 rows count.
+    """
+    rows = np.unique(np.linspace(0, transmission.value.shape[1] - 1, 16).astype(int))
+    value, variance = transmission.value[:, rows], transmission.variance[:, rows]
+    with np.errstate(invalid="ignore"):
+        lit = value > 3 * np.sqrt(variance)
+        is_dark = lit.mean((1, 2)) < LIT_SHARE
+        low, high = np.percentile(np.where(np.isfinite(value), value, 0.0), (1, 99), axis=(1, 2))
+    return is_dark, low > AIR_RANGE[1] * np.median(high)
+
+
 def find_air(transmission: Transmission) -> Air | None:
     """Measure the air at both edges of the detector, such as of flats taken at another current.
 

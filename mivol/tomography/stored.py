@@ -287,11 +287,16 @@ class LayerMatrix:
         """Layers (rows, voxels) of projections."""
         return self.transposed._multiply(y.transpose(1, 0, 2).reshape(y.shape[1], -1))
 
-    @cached_property
+    @property
     def _order(self) -> np.ndarray:
         """Order of the rows by strips of ``LANES`` rows of all lines, which read the same columns while a cache holds them."""
         line, place = np.divmod(np.arange(len(self.first)), self.per_line[0])
         return np.lexsort((place, line, place // LANES))
+
+    @cached_property
+    def _place(self) -> np.ndarray:
+        """Place of each row in ``_order``: to gather takes a tenth of the time of a scatter."""
+        return np.argsort(self._order)
 
     @cached_property
     def _rows(self) -> _Rows:
@@ -308,7 +313,7 @@ class LayerMatrix:
             numbers = [dr.opaque(mi.UInt32, n) for n in (first, count, self.width)]
             products = multiply(self._rows, pack(packed, given, *numbers))
             for layer, product in zip(result[first : first + width], products, strict=False):
-                layer[self._order] = product.numpy()
+                np.take(product.numpy(), self._place, out=layer, mode="clip")
         return result
 
 

@@ -175,6 +175,19 @@ def test_edges_that_are_no_air(case: str) -> None:
         assert air is None
 
 
+def test_views_that_a_camera_lost() -> None:
+    """A closed shutter leaves noise about 0, a frame too bright no absorption; a view with 2 % of the light counts."""
+    light = disc(1.0)
+    assert not np.any(preprocess.find_lost_views(light))
+    noise = light.value[20] - np.median(light.value[20], axis=0)
+    for view, level in ((4, 0.0), (9, 0.02), (13, 1.2), (17, 1.3)):
+        light.value[view] = level + 0.1 * noise
+    light.value[3, 1, 2] = np.nan
+    light.variance[4] *= 0.01
+    is_dark, is_bright = preprocess.find_lost_views(light)
+    assert np.flatnonzero(is_dark).tolist() == [4] and np.flatnonzero(is_bright).tolist() == [17]
+
+
 def test_air_is_a_straight_line_through_both_edges() -> None:
     """Means of 2 and of 4 of the finite pixels in two columns at either edge, between their middles and beyond."""
     value = np.array([[[1.0, 3, 9, 9, np.nan, 4]]])

@@ -97,6 +97,8 @@ def test_a_folder_of_images(tmp_path: Path) -> None:
     assert any("preview.tif: not used" in line for line in draft.lines)
     (folder / "theta.txt").write_text("\n".join(map(str, np.linspace(0, np.pi, 16)[:13])))
     assert any("no file with 12 angles (theta.txt has 13)" in line for line in draft_scan(folder).lines)
+    (folder / "table.csv").write_text("view,angle\n0,0.0\n1,0.1\n")
+    assert any("(table.csv is not one column of numbers, theta.txt has 13)" in line for line in draft_scan(folder).lines)
     (folder / "theta.txt").write_text("\n".join(map(str, np.linspace(0, np.pi, 16)[:12])))
     assert draft_scan(folder).raw["data"]["angle_unit"] == "degree"
     for name in ("proj", "Flats", "dark_field"):
@@ -105,6 +107,16 @@ def test_a_folder_of_images(tmp_path: Path) -> None:
             file.rename(tmp_path / "two" / name / file.name.replace(file.name[:4], "img_"))
     data = draft_scan(tmp_path / "two").raw["data"]
     assert {Path(data[role]).parent.name for role in ("file", "flats", "darks")} == {"proj", "Flats", "dark_field"}
+
+
+def test_a_gap_in_the_numbers_is_said(tmp_path: Path) -> None:
+    """One of twelve: the views are not spread evenly. Numbers in steps of ten, or after a prefix of digits, have no gap."""
+    folder = write_tiffs(tmp_path / "a")
+    assert not any("no view with the number" in line for line in draft_scan(folder).lines)
+    (folder / "scan12_0005.tif").unlink()
+    assert any("found: no view with the number 5: if views were lost" in line for line in draft_scan(folder).lines)
+    assert found_scan.missing_numbers([Path(f"a_{10 * k}.tif") for k in range(12)]) == []
+    assert found_scan.missing_numbers([Path("a.tif")]) == []
 
 
 @pytest.mark.parametrize(("flats", "darks"), [("refHST_", "darkend"), ("OpenBeam", "camOffset"), ("I0", "DI_")])

@@ -24,7 +24,7 @@ from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts
 from mivol.tomography.geometry import ConeBeam, ParallelBeam
 from mivol.tomography.panel_views import helix
 from mivol.tomography.phantoms import shepp_logan
-from mivol.tomography.preprocess import Air, Quanta, Transmission
+from mivol.tomography.preprocess import Air, Quanta, Transmission, assume_quantum_noise
 from mivol.tomography.rotation_axis import Axis
 
 
@@ -203,6 +203,37 @@ def test_air_is_looked_for_unless_the_settings_say(monkeypatch: pytest.MonkeyPat
     assert found[:2] == (light, None) and "data.air = 4 divides by it" in found[2][0]
     air = replace(air, is_needed=True, factor=np.array([0.5, 0.6]))
     assert "has 0.5 to 0.6 of" in projections.correct_air(light, None)[2][0]
+
+
+@pytest.mark.parametrize("beam", ["parallel", "cone"])
+def test_lost_views_are_left_out_and_said(tmp_path: Path, beam: str, variant_rgb: str) -> None:
+    """The shutter closed for view 5, and view 17 is saturated: the others give the axis, and the air of .8, as without them."""
+    distances = {"source_to_axis": 400.0, "source_to_detector": 500.0} if beam == "cone" else {}
+    angles = np.radians(360 / 40 * np.arange(40))
+    place = {"axis_offset": 2.0}
+    geometry = ConeBeam(angles, (2, 60), **distances, **place) if beam == "cone" else ParallelBeam(angles, (2, 60), **place)
+    head = shepp_logan(half_width=16.0)
+    light = 0.8 * np.exp(-0.02 * head.integrate_lines(*geometry.rays(), whole_lines=True)).astype(np.float32)
+    scan = {"beam": beam, "arc": 360.0, **distances}
+    settings = {"title": "a", "scan": scan, "data": {"source": "stack", "file": "a.npy", "reading": "transmission"}}
+
+    def read() -> projections.Projections:
+        np.save(tmp_path / "a.npy", light)
+        return projections.read_measured(config.from_dict(settings, "a"), tmp_path)
+
+    whole = read()
+    light[5], light[17] = 0, 2.5
+    found = read()
+    assert found.geometry.axis_offset == pytest.approx(whole.geometry.axis_offset, abs=0.1)
+    used = np.setdiff1d(np.arange(40), (5, 17))
+    assert (found.weights[[5, 17]] == 0).all() and (found.weights[used] > 0).all()
+    np.testing.assert_allclose(found.y[used], whole.y[used], atol=1e-6)
+    assert found.notes[:2] == (
+        "1 of 40 views are not used, because they are without light: 5 (counted from 0)",
+        "1 of 40 views are not used, because they are brighter than any view can be: 17 (counted from 0)",
+    )
+    light[:] = 0
+    assert projections.leave_out_lost_views(assume_quantum_noise(light))[1] == []
 
 
 def test_a_scan_without_rings_stays() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import weakref
 
 import numpy as np
 import pytest
@@ -162,3 +163,15 @@ def test_eliminated_gains_are_those_of_the_joint_minimum(scan):
     assert state.residual_norm == pytest.approx(np.linalg.norm(left), rel=1e-6)
     found = gains.fit(y - (a @ state.x).reshape(y.shape))[0]
     np.testing.assert_allclose(found, second.T @ wanted[a.shape[1] :], atol=1e-4)
+
+
+def test_the_first_volume_is_let_go(scan) -> None:
+    """It is as large as the state, and no later step reads it."""
+    a, _, b = scan
+    x0 = np.full(a.shape[1], 0.25)
+    kept, problem = weakref.ref(x0), ProjectionProblem(LeastSquares(a, b, x0=x0, nonnegative=True))
+    solve = LinearSolve(solver="pcg").begin(problem)
+    del x0
+    solve.step(0, 1.0)
+    assert kept() is None and problem.linear_problem.x0 is None
+    assert solve.step(1, 1.0) < np.sum(b**2) / 2

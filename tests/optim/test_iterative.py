@@ -126,7 +126,9 @@ def test_pcg_with_prior_reaches_the_minimum_that_lbfgs_finds(scan):
 
     def objective(x):
         r = problem.A @ x - problem.b
-        return (0.5 * np.sum(problem.weights * r * r) + prior.value(x), problem.A.T @ (problem.weights * r) + prior.gradient(x))
+        gradient = problem.A.T @ (problem.weights * r)
+        prior.add_derivatives(x, gradient, np.zeros_like(x))
+        return 0.5 * np.sum(problem.weights * r * r) + prior.value(x), gradient
 
     options = {"maxiter": 5000, "maxfun": 20000, "ftol": 1e-15, "gtol": 1e-10}
     found = scipy.optimize.minimize(objective, np.zeros(GRID.size), jac=True, bounds=[(0, None)] * GRID.size, options=options)
@@ -328,7 +330,25 @@ def test_solver_explains_the_data(scan, name):
     assert list_citations(SOLVERS[name].cites)
 
 
+def test_a_direction_that_ascends_gives_way_to_the_scaled_gradient(scan, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The step is that of the same volume without a memory of directions."""
+    prior = SmoothedTV(GRID.shape, 0.05, 0.3, GRID.voxel_size)
+    problem = problem_for("pcg", scan, nonnegative=True, prior=prior)
+    state = run("pcg", problem, 3)[-1]
+    expected = run("pcg", problem, 1, state=replace(state, memory={}))[-1]
+    descend, asked = iterative._descend, []
+
+    def refuse_first(*given: object) -> object:
+        asked.append(given)
+        return None if len(asked) == 1 else descend(*given)
+
+    monkeypatch.setattr(iterative, "_descend", refuse_first)
+    found = run("pcg", problem, 1, state=state)[-1]
+    assert len(asked) == 2 and np.abs(found.x - expected.x).max() < 1e-10
+    assert np.abs(found.x - state.x).max() > 1e-4
+
+
 def test_every_block_of_a_step_stays_nonnegative(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(linear_problems, "BLOCK", 2)
     x = np.ones(5)
-    assert [iterative._stays_nonnegative(x, -1.0001 * (np.arange(5) == k)) for k in (0, 3, 4, 5)] == [False, False, False, True]
+    assert [iterative._stays_nonnegative(x, -1.0001, np.arange(5) == k) for k in (0, 3, 4, 5)] == [False, False, False, True]

@@ -302,6 +302,8 @@ class SolverRun(OptimizerRun):
                 raise MivolError("found only weights or line integrals of 0, so nothing to reconstruct: check the data.")
             self.stop_reason = "no direction lowers the objective"
             return None
+        if self.problem.linear_problem.x0 is not None:  # a field that no later step reads
+            self.problem.linear_problem = replace(self.problem.linear_problem, x0=None)
         self._store(state)
         return state.objective
 

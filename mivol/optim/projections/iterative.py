@@ -166,58 +166,63 @@ def projected_cg(problem: LeastSquares, state: SolverState | None = None, precon
         state = _ls_state(problem, x, 0, r, {"residual": r})
     elif "residual" not in state.memory:
         state = replace(state, memory={"residual": flatten(problem.b, a.dtype) - a @ state.x})
+    problem = replace(problem, x0=None)  # the state holds the volume now
     while True:
-        directions = _direction(problem, state, data_diagonal, weigh)
-        if directions is None:
+        found = _direction(problem, state, data_diagonal, weigh)
+        if found is None:
             return
-        direction, downhill, memory = directions
-        g = memory["gradient"]
-        ways = (_descend(problem, weigh, sample, state.x, g, way) for way in (direction, downhill))
-        step = next((way for way in ways if way is not None), None)
+        direction, g = found["direction"], found["gradient"]
+        step = _descend(problem, weigh, sample, state.x, g, direction)
+        if step is None and "direction" in state.memory:
+            # Seldom: so the scaled gradient is computed again, where keeping it would cost another field.
+            diagonal = _add_majoriser(problem, state.x, np.zeros_like(g), data_diagonal)
+            step = _descend(problem, weigh, sample, state.x, g, _scale_descent(problem, state.x, g, diagonal))
         if step is None:
             return
         x, r = np.add(state.x, step[0], out=step[0]), state.memory["residual"] - step[1]
         if problem.nonnegative:
             np.maximum(x, 0, out=x)  # rounding: the step ends in the domain
-        state = _ls_state(problem, x, state.iteration + 1, r, {"residual": r, **memory})
+        state = _ls_state(problem, x, state.iteration + 1, r, {"residual": r, **found})
         yield state
 
 
 def _direction(
     problem: LeastSquares, state: SolverState, data_diagonal: np.ndarray | None, weigh: Weighting
-) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]] | None:
-    """The conjugate direction, the scaled descent direction, and memory for the next direction; None at the minimum."""
-    x, memory, prior = state.x, state.memory, problem.prior
+) -> dict[str, np.ndarray] | None:
+    """The conjugate direction, and memory for the next direction; None at the minimum."""
+    x, memory = state.x, state.memory
     g = problem.A.T @ weigh(memory["residual"])
     np.negative(g, out=g)
-    if prior:
-        g += prior.gradient(x)
-    z = _scaled_gradient(problem, x, g, data_diagonal)
-    gz = dot(g, z)
+    direction = _scale_descent(problem, x, g, _add_majoriser(problem, x, g, data_diagonal))
+    gz = -dot(g, direction)
     if not gz > 0:
         return None
-    downhill = np.negative(z, out=z)
-    direction = downhill.copy()
     if "direction" in memory:
-        beta = np.asarray(max(0.0, (gz + dot(memory["gradient"], downhill)) / float(memory["gz"])), x.dtype)
+        beta = np.asarray(max(0.0, (gz + dot(memory["gradient"], direction)) / float(memory["gz"])), x.dtype)
         for part in blocks(len(x)):
             last = beta * memory["direction"][part]
             direction[part] += last * ((x[part] > 0) | (g[part] < 0)) if problem.nonnegative else last
-    return direction, downhill, {"direction": direction, "gradient": g, "gz": np.asarray(gz)}
+    return {"direction": direction, "gradient": g, "gz": np.asarray(gz)}
 
 
-def _scaled_gradient(problem: LeastSquares, x: np.ndarray, g: np.ndarray, data_diagonal: np.ndarray | None) -> np.ndarray:
-    """The gradient over the diagonal of the majoriser, 0 at voxels that the bound holds."""
-    z = np.ones_like(g)
-    if data_diagonal is not None:
-        z = problem.prior.separable(x) if problem.prior else np.zeros_like(g)
-        z += data_diagonal
-    largest = float(np.max(z, initial=0.0))
+def _add_majoriser(problem: LeastSquares, x: np.ndarray, g: np.ndarray, data_diagonal: np.ndarray | None) -> np.ndarray:
+    """Add the gradient of the prior to ``g``; return the diagonal of the majoriser, 1 without a preconditioner."""
+    diagonal = np.zeros_like(g) if data_diagonal is None else data_diagonal.copy()
+    if problem.prior:
+        problem.prior.add_derivatives(x, g, diagonal)
+    if data_diagonal is None:
+        diagonal.fill(1)
+    return diagonal
+
+
+def _scale_descent(problem: LeastSquares, x: np.ndarray, g: np.ndarray, diagonal: np.ndarray) -> np.ndarray:
+    """The negative gradient over the diagonal, in whose place it is written; 0 at voxels that the bound holds."""
+    largest = float(np.max(diagonal, initial=0.0))
     for part in blocks(len(x)):
-        z[part] = g[part] * reciprocal(z[part], largest)
+        diagonal[part] = g[part] * -reciprocal(diagonal[part], largest)
         if problem.nonnegative:
-            z[part] *= (x[part] > 0) | (g[part] < 0)
-    return z
+            diagonal[part] *= (x[part] > 0) | (g[part] < 0)
+    return diagonal
 
 
 SAMPLED, MIN_SAMPLES = 8, 2
@@ -240,7 +245,7 @@ def _descend(
             return None
         rough, image = lowest
         step = np.asarray(rough, x.dtype) * direction
-        if not problem.nonnegative or _stays_nonnegative(x, step):
+        if not problem.nonnegative or _stays_nonnegative(x, 1, step):
             return step, np.asarray(rough, x.dtype) * image
     else:
         step = np.asarray(rough, x.dtype) * direction
@@ -255,8 +260,9 @@ def _descend(
     return step, length * lowest[1]
 
 
-def _stays_nonnegative(x: np.ndarray, step: np.ndarray) -> bool:
-    return all((x[part] + step[part]).min() >= 0 for part in blocks(len(x)))
+def _stays_nonnegative(x: np.ndarray, length: float, direction: np.ndarray) -> bool:
+    length = np.asarray(length, x.dtype)
+    return all((x[part] + length * direction[part]).min() >= 0 for part in blocks(len(x)))
 
 
 def _minimum(
@@ -296,7 +302,7 @@ class _Sample:
         """Length to the minimum along ``d`` by the sample's curvature; None if ``d`` ascends, or stays in the domain."""
         image = self.a @ d
         length = _length(problem, x, g, d, self.all_over_some * dot(image, apply_weights(self.weights, image)))
-        return None if length is None or _stays_nonnegative(x, np.asarray(length, x.dtype) * d) else length
+        return None if length is None or _stays_nonnegative(x, length, d) else length
 
 
 def cgls(problem: LeastSquares, state: SolverState | None = None) -> Iterator[SolverState]:
@@ -334,7 +340,7 @@ def transmission_likelihood(problem: PoissonCounts, state: SolverState | None = 
         gradient = a.T @ counts.slope(line).astype(a.dtype)
         bound = a.T @ (counts.optimum_curvature(line) * chord).astype(a.dtype)
         if prior:
-            gradient, bound = gradient + prior.gradient(x), bound + prior.separable(x)
+            prior.add_derivatives(x, gradient, bound)
         x = np.maximum(x - gradient * reciprocal(bound), 0)
         state = counts.state(x, state.iteration + 1, a @ x)
         yield state

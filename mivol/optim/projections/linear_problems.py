@@ -267,17 +267,18 @@ class SmoothedTV:
         """The penalty."""
         return self._scale * self._sum(_penalties, x)
 
-    def gradient(self, x: np.ndarray) -> np.ndarray:
-        """(n,) derivative of the penalty."""
-        return self._fill(_penalty_gradient, x)
+    def add_derivatives(self, x: np.ndarray, gradient: np.ndarray, diagonal: np.ndarray) -> None:
+        """Add the derivative (n,) of the penalty, and a diagonal (n,) of its majoriser, to arrays of the caller.
+
+        The diagonal follows from ``(p - q)^2 <= 2 p^2 + 2 q^2`` on each difference.
+        """
+        for voxels, (slope, bound) in self._run(_derivatives, x):
+            gradient[voxels] += slope
+            diagonal[voxels] += bound
 
     def curvature(self, x: np.ndarray, p: np.ndarray) -> float:
         """Second derivative of the majoriser at ``x`` along ``p``."""
         return self._scale * self._sum(_curvatures, x, p)
-
-    def separable(self, x: np.ndarray) -> np.ndarray:
-        """(n,) diagonal that majorises: ``(p - q)^2 <= 2 p^2 + 2 q^2`` on each difference."""
-        return self._fill(_separable_diagonal, x)
 
     def share_of_edges(self, x: np.ndarray) -> float:
         """Share of voxels with a slope of ``delta`` or more, which are preserved as edges."""
@@ -291,17 +292,11 @@ class SmoothedTV:
     def _scale(self) -> float:
         return self.strength * float(np.prod(self._spacing))
 
-    def _fill(self, function: Callable, x: np.ndarray) -> np.ndarray:
-        result = np.empty_like(x)
-        for voxels, part in self._run(function, x):
-            result[voxels] = part
-        return result
-
     def _sum(self, function: Callable, *fields: np.ndarray) -> float:
-        return float(sum(part.sum(dtype=np.float64) for _, part in self._run(function, *fields)))
+        return float(sum(part.sum(dtype=np.float64) for _, (part,) in self._run(function, *fields)))
 
-    def _run(self, function: Callable, *fields: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
-        """One number for each voxel, part by part, by a kernel that reads fields (n,) in place."""
+    def _run(self, function: Callable, *fields: np.ndarray) -> Iterator[tuple[slice, list[np.ndarray]]]:
+        """Numbers for each voxel, part by part, by a kernel that reads fields (n,) in place."""
         array = mi.Float64 if fields[0].dtype == np.float64 else mi.Float
         given = [array(np.ascontiguousarray(x, fields[0].dtype).reshape(-1)) for x in fields]
         n_z, n_y, n_x = self.shape
@@ -311,11 +306,11 @@ class SmoothedTV:
         for first in range(0, fields[0].size, KERNEL_VOXELS):
             count = min(KERNEL_VOXELS, fields[0].size - first)
             lattice = _Slopes(dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first), sizes, inverses, numbers)
-            yield slice(first, first + count), _record(function)(lattice, *given).numpy()
+            yield slice(first, first + count), [found.numpy() for found in _record(function)(lattice, *given)]
 
 
-KERNEL_VOXELS = 1 << 22
-"""Voxels of a kernel of the total variation: its result takes 16 MiB."""
+KERNEL_VOXELS = 1 << 20
+"""Voxels of a kernel of the total variation: a result takes 4 MiB, which Dr.Jit keeps for the next one."""
 
 
 @cache
@@ -364,44 +359,30 @@ class _Slopes:
         """``psi'(t) / t`` of the length t of the gradient."""
         return 1 / dr.maximum(dr.sqrt(sum(d * d for d in differences)), self.numbers[3])
 
-    def gather_ends(self, x: mi.Float, part: Callable[[mi.Float, mi.Float, int], tuple[mi.Float, mi.Float]]) -> mi.Float:
-        """Sum over differences that begin or end at a voxel: ``part(w, d, axis)`` is the share of a begin, and of an end."""
-        own, total = self.differences(x), 0
-        w = self.inverse_slope(own)
-        for axis, (is_before, is_after) in enumerate(self.neighbours()):
-            total += dr.select(is_after, part(w, own[axis], axis)[0], 0)
-            before = self.differences(x, axis)
-            total += dr.select(is_before, part(self.inverse_slope(before), before[axis], axis)[1], 0)
-        return total
 
-
-def _penalties(slopes: _Slopes, x: mi.Float) -> mi.Float:
+def _penalties(slopes: _Slopes, x: mi.Float) -> list[mi.Float]:
     t, delta = dr.sqrt(sum(d * d for d in slopes.differences(x))), slopes.numbers[3]
-    return dr.select(t < delta, t * t / (2 * delta), t - delta / 2)
+    return [dr.select(t < delta, t * t / (2 * delta), t - delta / 2)]
 
 
-def _edges(slopes: _Slopes, x: mi.Float) -> mi.Float:
-    return dr.select(dr.sqrt(sum(d * d for d in slopes.differences(x))) >= slopes.numbers[3], mi.Float(1), 0)
+def _edges(slopes: _Slopes, x: mi.Float) -> list[mi.Float]:
+    return [dr.select(dr.sqrt(sum(d * d for d in slopes.differences(x))) >= slopes.numbers[3], mi.Float(1), 0)]
 
 
-def _curvatures(slopes: _Slopes, x: mi.Float, p: mi.Float) -> mi.Float:
-    return slopes.inverse_slope(slopes.differences(x)) * sum(d * d for d in slopes.differences(p))
+def _curvatures(slopes: _Slopes, x: mi.Float, p: mi.Float) -> list[mi.Float]:
+    return [slopes.inverse_slope(slopes.differences(x)) * sum(d * d for d in slopes.differences(p))]
 
 
-def _penalty_gradient(slopes: _Slopes, x: mi.Float) -> mi.Float:
-    def ends(w: mi.Float, d: mi.Float, axis: int) -> tuple[mi.Float, mi.Float]:
-        flow = w * d * (slopes.numbers[4] * slopes.numbers[axis])
-        return -flow, flow
-
-    return slopes.gather_ends(x, ends)
-
-
-def _separable_diagonal(slopes: _Slopes, x: mi.Float) -> mi.Float:
-    def ends(w: mi.Float, _: mi.Float, axis: int) -> tuple[mi.Float, mi.Float]:
-        part = w * (2 * slopes.numbers[4] * slopes.numbers[axis] ** 2)
-        return part, part
-
-    return slopes.gather_ends(x, ends)
+def _derivatives(slopes: _Slopes, x: mi.Float) -> list[mi.Float]:
+    """Derivative of the penalty, and diagonal of its majoriser: sums over differences that begin or end at a voxel."""
+    own, gradient, diagonal = slopes.differences(x), 0, 0
+    w = slopes.inverse_slope(own)
+    for axis, (is_before, is_after) in enumerate(slopes.neighbours()):
+        before, scale = slopes.differences(x, axis), slopes.numbers[4] * slopes.numbers[axis]
+        begins, ends = dr.select(is_after, w, 0), dr.select(is_before, slopes.inverse_slope(before), 0)
+        gradient += scale * (ends * before[axis] - begins * own[axis])
+        diagonal += 2 * scale * slopes.numbers[axis] * (begins + ends)
+    return [gradient, diagonal]
 
 
 CHORD = 0.47
