@@ -190,7 +190,7 @@ class RunFolder:
                 results.append((figure, quantity.symbol, quantity.label))
         words = [f"{label} {figure} {symbol}".rstrip() for figure, symbol, label in join_channels(results)]
         times = ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in self.record.timings.items())
-        return f"saved: {', '.join(words)}" + (f" ({times})" if times else "")
+        return f"result: {', '.join(words)}" + (f" ({times})" if times else "")
 
     def rewind(self, iteration: int) -> None:
         """Remove the metrics after an iteration, to keep a resumed run from repeating rows."""

@@ -387,7 +387,7 @@ def choose_image_branches(needs: Needs, settings: Settings, segment: str) -> tup
     total = noise.stem + noise.branch
     share = f"light behind first collisions has {noise.branch / total if total > 0 else 0:.0%} of the noise in a preview"
     if gain < MIN_BRANCHING_GAIN:
-        return 1, [Choice("paths in images", "each path has one end", share)]
+        return 1, [Choice("paths in images", "paths do not branch", share)]
     why = f"{share}, and {noise.share:.0%} of the camera rays collide: the same error {gain:.2g} times as fast"
     return best, [Choice("paths in images", f"paths have {best} branches behind their first collision", why)]
 
@@ -439,7 +439,7 @@ def choose_near_light(needs: Needs, settings: Settings, segment: str) -> tuple[b
     if needs.nearness == 0:
         why = "an emitter with a position lies inside a medium, and its light at collisions has a heavy tail"
         return True, True, [Choice(subject, f"{segments}; directions are drawn around emitters inside", why)]
-    where = f"the nearest emitter with a position is {needs.nearness:.2g} edges away from a medium"
+    where = f"the nearest emitter with a position is {needs.nearness:.2g} edge lengths away from a medium"
     if needs.nearness >= NEAR_DISTANCE:
         return False, False, [Choice(subject, vertices, where)]
     if needs.near_gain is None:
@@ -474,7 +474,7 @@ def choose_lamp_rays(needs: Needs, settings: Settings) -> tuple[int, list[Choice
     gain = (edge + rest) / work[best] if work[best] > 0 else 0.0
     share = f"edges of lamps have {edge / (edge + rest) if edge + rest > 0 else 0:.0%} of the noise in a preview"
     if gain < MIN_LAMP_GAIN:
-        return 0, [Choice("lamps in view", "seen by paths", share)]
+        return 0, [Choice("lamps in view", "found by paths", share)]
     why = f"{share}; their rays are cheap, and reach the same error {gain:.2g} times as fast"
     return best, [Choice("lamps in view", f"{best} camera rays of their own for each path, in images", why)]
 
@@ -548,7 +548,7 @@ def describe_orders(needs: Needs, settings: Settings, segment: str, draws_near_l
     """Say which estimator finds which order of scattering in images, and why; None without scattered light."""
     if not is_scattering_visible(needs, settings):
         return None
-    subject = "orders of light"
+    subject = "scattering orders"
     if segment != "free_flight":
         return Choice(
             subject, "one scattering, at points of each camera ray", "no light scatters twice, and none is left to chance"
@@ -564,7 +564,7 @@ def describe_orders(needs: Needs, settings: Settings, segment: str, draws_near_l
     if flies_aside:
         method = "the first at collisions, the second and later ones also by side flights and directions about the emitter"
         return Choice(subject, method, "a peaked phase function turns light towards the path near the emitter's direction only")
-    return Choice(subject, "each at the collisions of a path", "the light of emitters is even along a flight")
+    return Choice(subject, "each at the collisions of a path", "the light of emitters changes little along a flight")
 
 
 def choose_scattering_points(needs: Needs, settings: Settings, segment: str) -> tuple[int, list[Choice]]:

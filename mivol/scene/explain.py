@@ -196,8 +196,8 @@ def _describe_plan(
         lines += [f"  shadows   {text}" for text in _describe_light_grid(scene, needs, plan, settings)]
     if noise is not None and is_scattering_visible(needs, settings):
         answer = find_sufficient_depth(scene, eye, settings, noise)
-        depth = "without a limit (-1)" if answer.depth < 0 else answer.depth
-        lines += [f"  depth     {depth} is enough\n              because {answer.reason}"]
+        depth = "-1 (no limit)" if answer.depth < 0 else answer.depth
+        lines += [f"  depth     max_depth {depth} is enough\n              because {answer.reason}"]
     return [*lines, "references", *(f"  {source}" for source in list_citations(SEGMENT_ESTIMATORS[plan.segment].cites))]
 
 

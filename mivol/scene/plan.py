@@ -348,11 +348,11 @@ def _plan_gradient_memory(needs: Needs) -> tuple[int, Choice]:
         for (z, y, x), bricks in zip(medium.resolutions, medium.bricks or (0,) * len(medium.resolutions), strict=True):
             if bricks:
                 memory += 8 * VOXELS * bricks * channels
-                ways.add("added to the stored nodes")
+                ways.add("stored nodes")
                 continue
             packs = needs.variant.startswith("llvm") and packs_gradient((z, y, x), channels, needs.crop_samples)
             memory += (gradient_bytes((z, y, x), channels) if packs else 0) + 8 * z * y * x * channels
-            ways.add("packed corners, one copy per thread" if packs else "added to the nodes")
+            ways.add("corners of cells, one copy per thread" if packs else "nodes")
     # Asking for the free memory takes as long as all other choices: a small step is not asked about.
     asks = needs.parameters and memory > SMALL_STEP
     free = free_memory() if asks else None

@@ -77,7 +77,7 @@ def test_the_noise_that_is_asked_for_decides_which_depth_is_enough(
     for noise in ("1", "1e-4"):
         code, said = explained(capsys, folder / "scene.xml", "--noise", noise)
         assert code == 0
-        found = re.search(r"depth +(\d+|without a limit \(-1\)) is enough", said)
+        found = re.search(r"max_depth (\d+|-1 \(no limit\)) is enough", said)
         assert found is not None
         depths[noise] = found[1]
     assert depths["1"] == "2"

@@ -302,7 +302,7 @@ def test_the_plan_knows_where_emitters_are():
     draws, (why,) = _draws({"smoke": grid, "lamp": point([0.2, 0, 0])[0]})
     assert draws and "inside a medium" in why
     draws, (why,) = _draws({"smoke": grid, "lamp": point([0, 0, 9.0])[0]})
-    assert not draws and "4 edges away" in why
+    assert not draws and "4 edge lengths away" in why
     assert _draws({"smoke": grid, "sky": scenes.sky()}) == (False, [])
     assert _draws({"smoke": grid, "lamp": point([0.2, 0, 0])[0]}, max_depth=2) == (False, [])
     assert _draws({"smoke": grid, "lamp": point([0.2, 0, 0])[0]}, near_light="vertices")[0] is False
@@ -313,7 +313,7 @@ def test_a_preview_decides_for_emitters_close_by():
     """Half an edge above the smoke: explain says what the preview has found."""
     scene = close_up({"smoke": smoke(rough_grid(1))[0], "lamp": point([0, 0, 2.0])[0]}, res=8)
     text = explain_scene(scene, max_depth=4).text
-    assert "0.5 edges away from a medium; a distance on each segment reaches the same error" in text
+    assert "0.5 edge lengths away from a medium; a distance on each segment reaches the same error" in text
 
 
 @pytest.mark.parametrize(

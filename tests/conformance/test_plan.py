@@ -57,13 +57,13 @@ def test_memory_of_a_gradient_is_counted(monkeypatch: pytest.MonkeyPatch, extinc
     monkeypatch.setattr(plan, "free_memory", lambda: None)
     memory, choice = plan._plan_gradient_memory(needs(fog(small, extinction=extinction)))
     assert memory == packed + 8 * nodes * channels
-    assert choice.choice == f"{memory / 2**20:.1f} MiB besides the rays (packed corners, one copy per thread)"
+    assert choice.choice == f"{memory / 2**20:.1f} MiB besides the rays (corners of cells, one copy per thread)"
     assert (choice.subject, choice.reason) == ("gradient step", "no parameter has gradients yet")
     elsewhere, _ = plan._plan_gradient_memory(needs(fog(small, extinction=extinction), variant="cuda_ad_rgb"))
     assert elsewhere == 8 * nodes * channels
     both, choice = plan._plan_gradient_memory(needs(fog(small, large, extinction=extinction), fog(), parameters=("a", "b")))
     assert both == memory + 8 * 2000**3 * channels
-    assert "(added to the nodes; packed corners, one copy per thread)" in choice.choice and choice.reason.endswith(" by a, b")
+    assert "(corners of cells, one copy per thread; nodes)" in choice.choice and choice.reason.endswith(" by a, b")
     nothing, choice = plan._plan_gradient_memory(needs(fog()))
     assert nothing == 0 and choice.choice == "0.0 MiB besides the rays (no grid)"
 

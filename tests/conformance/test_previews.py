@@ -86,8 +86,9 @@ def test_what_is_left_out_is_what_renders_differ_by(variant_rgb: str) -> None:
 def test_explain_says_which_depth_is_enough(variant_rgb: str) -> None:
     scene = fog(SIGMA, ALBEDO)
     said = explain(scene, max_depth=2, noise=0.5)
-    assert "depth     2 is enough\n              because depth 2 leaves out" in said and "noise of 50.00% is requested" in said
-    assert "without a limit (-1) is enough" in explain(scene, max_depth=2, noise=1e-9)
+    assert "depth     max_depth 2 is enough\n              because depth 2 leaves out" in said
+    assert "noise of 50.00% is requested" in said
+    assert "max_depth -1 (no limit) is enough" in explain(scene, max_depth=2, noise=1e-9)
     assert "is enough" not in explain(scene, max_depth=2) + explain(scene, max_depth=1, noise=0.5)
 
 
@@ -176,7 +177,7 @@ SUN = {"type": "directional", "direction": [0, 0, -1], "irradiance": 2.0}
 )
 def test_explain_says_what_finds_which_order(variant_rgb: str, g: float, light: dict, depth: int, words: str) -> None:
     text = explain(lit_fog(g, lamp=light), max_depth=depth)
-    (line,) = (line for line in text.splitlines() if line.startswith("  orders of light"))
+    (line,) = (line for line in text.splitlines() if line.startswith("  scattering orders"))
     assert words in line
 
 

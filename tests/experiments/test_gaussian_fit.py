@@ -129,7 +129,7 @@ def test_the_best_gaussians_are_kept_beside_the_last(
     risen, saved = capsys.readouterr().err.strip().splitlines()[-2:]
     assert "was best at iteration 80, 25 dB, and is 20 dB at the end: gaussians_best.ply holds the best iterate" in risen
     assert risen in json.loads((tmp_path / "run/run.json").read_text())["notes"]
-    assert saved.startswith("saved: ")
+    assert saved.startswith("result: ")
 
 
 @pytest.mark.slow

@@ -183,7 +183,7 @@ def test_the_best_field_is_kept_beside_the_last(
     risen, saved = capsys.readouterr().err.strip().splitlines()[-2:]
     assert "was best at iteration 20, 25 dB, and is 20 dB at the end: field_best.npz holds the best iterate" in risen
     assert risen in record["notes"]
-    assert saved.startswith("saved: ")
+    assert saved.startswith("result: ")
     assert f"PSNR of the held-out views {record['results']['held_out_psnr']:.4g} dB" in saved
 
 

@@ -261,13 +261,13 @@ def test_the_best_iterate_may_be_files(tmp_path: Path) -> None:
 def test_the_summary_is_what_was_recorded(tmp_path: Path) -> None:
     run = folder(tmp_path)
     run.record.results = {"held_out_psnr": 30.25, "nrmse": 0.863, "gone": None}
-    assert run.summary() == "saved: PSNR of the held-out views 30.25 dB, nRMSE of the volume 0.863"
+    assert run.summary() == "result: PSNR of the held-out views 30.25 dB, nRMSE of the volume 0.863"
     # A count is said to the last digit.
     run.record.results = {"gaussians": 12345.0}
-    assert run.summary() == "saved: Gaussians 12345"
+    assert run.summary() == "result: Gaussians 12345"
     # The time of all stages, not that of the iterations alone.
     run.record.timings = {"projections": 0.25, "solve": 77.04}
-    assert run.summary() == "saved: Gaussians 12345 (projections 0.2 s, solve 77.0 s)"
+    assert run.summary() == "result: Gaussians 12345 (projections 0.2 s, solve 77.0 s)"
 
 
 SCAN = {

@@ -199,7 +199,7 @@ def test_more_iterations_resume_a_run_that_is_done(variant_rgb, folder: Path, ca
     record = json.loads((folder / "more" / "run.json").read_text())
     assert record["command"].startswith("mivol optimize ")
     assert record["command"].endswith("more --resume")
-    assert said[-1].startswith("saved: ")
+    assert said[-1].startswith("result: ")
     assert f"nRMSE of the volume {record['results']['nrmse']:.4g}" in said[-1]
     assert run(folder, "--resume", "solve.iterations=3", to="more") == 1
     assert "solve.iterations is 6 there and 3 here" in capsys.readouterr().err
