@@ -96,10 +96,14 @@ def test_seven_representations(
 ) -> None:
     """Every representation shows the views that it was not fitted to: white paper has 11 dB.
 
-    Half of the squared error of white paper is 14 dB. The two networks take a quarter of the notebook's steps (15 and 21 dB).
+    Half of the squared error of white paper is 14 dB. The two networks take a quarter of the notebook's steps (15 and 21 dB),
+    and the others a third.
     """
     monkeypatch.chdir(tmp_path)
     shorter = {'"field.effort": 2.0': '"field.effort": 0.5', '"field.effort": 4.0': '"field.effort": 1.0'}
+    for last in ('"field.degree": 0', '"field.degree": 2', '"plenoxels", {"field.preset": "tiny"'):
+        shorter[last] = f'{last}, "field.effort": 0.3'
+    shorter['"gaussians.preset": "tiny"'] = '"gaussians.preset": "tiny", "gaussians.effort": 0.3'
     results = executed("seven_representations", shorter)["results"]
     assert list(results) == [
         "dense grid", "network", "octree", "grid with harmonics", "plenoxels", "hash grid", "gaussians"

@@ -10,7 +10,7 @@ from false_alarms import assert_same_mean
 from media_light_scenes import PLACE, seen
 from scattering_scenes import close_up
 
-from mivol.scene.media_light import find_emitting_boxes
+from mivol.scene.media_light import _estimate_variances, find_emitting_boxes
 from mivol.scene.needs import find_needs
 from mivol.transport.estimators.lighting.emission_sampling import (
     CELLS_PER_AXIS,
@@ -63,6 +63,13 @@ def test_cells_have_their_share_of_the_power() -> None:
     # Sums in float32 are off by a part of a cell's probability; each cell is drawn as often as its density says.
     drawn = np.diff(np.array(table.cumulative), prepend=0)
     assert drawn == pytest.approx(np.array(table.density) * volume, rel=1e-6)
+
+
+def test_a_surface_meets_no_light_behind_itself() -> None:
+    """The variance of light that is met by chance, on a floor below both boxes that looks up, and down."""
+    table, place = table_of(two()), mi.Point3f(0.1, 0.1, -0.7)
+    up, down = (_estimate_variances(table, place, mi.Vector3f(0, 0, z), mi.Bool(True))[0] for z in (1, -1))
+    assert up > 0 and down == 0
 
 
 def test_cells_are_told_apart_below_the_digits_of_a_number() -> None:

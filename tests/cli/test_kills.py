@@ -14,8 +14,8 @@ from script_modules import load
 from mivol.files import write_exr, write_png, write_volume
 
 ROOT = Path(__file__).resolve().parents[2]
-VERBS = ("reference", "export", "convert")
-"""Those whose processes are short; fits and pages are left to the script."""
+VERBS = ("reference", "convert")
+"""One that writes a folder, one that writes a file; the script does it to all verbs."""
 
 
 @pytest.mark.slow

@@ -76,25 +76,25 @@ def sources(variant_rgb: str, small: None, tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("source", "target"),
+    ("source", "target", "flags"),
     [
-        ("cloud.ply", "octree"),
-        ("cloud.ply", "grid"),
-        ("cloud.ply", "nested"),
-        ("nested.npz", "octree"),
-        ("nested.npz", "grid"),
-        ("nested.npz", "gaussians"),
-        ("tree.npz", "gaussians"),
+        ("cloud.ply", "octree", []),
+        ("cloud.ply", "grid", ["--resolution", "32"]),
+        ("cloud.ply", "nested", ["--resolution", "32"]),
+        ("nested.npz", "octree", []),
+        ("nested.npz", "grid", []),
+        ("nested.npz", "gaussians", []),
+        ("tree.npz", "gaussians", []),
     ],
 )
 def test_what_is_converted_shows_its_source(
-    sources: Path, capsys: pytest.CaptureFixture[str], source: str, target: str
+    sources: Path, capsys: pytest.CaptureFixture[str], source: str, target: str, flags: list[str]
 ) -> None:
     made = sources / ("made.ply" if target == "gaussians" else "made.npz")
     if source == "tree.npz":
         assert main(["convert", str(sources / "grid.npz"), str(sources / source), "--to", "octree"]) == 0
     capsys.readouterr()
-    assert main(["convert", str(sources / source), str(made), "--to", target]) == 0
+    assert main(["convert", str(sources / source), str(made), "--to", target, *flags]) == 0
     said = capsys.readouterr().out
     loss = next(float(line.split(" dB")[0].split()[-1]) for line in said.splitlines() if " dB" in line)
     # Half of the error of black views at least: 6 dB.

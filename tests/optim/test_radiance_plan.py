@@ -103,6 +103,12 @@ def test_former_last_stage_takes_half_its_steps() -> None:
     assert plan.with_longest(16) == plan
 
 
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_learns_densities_and_colours_to_its_end(name: str) -> None:
+    plan = PRESETS[name]
+    assert min(plan.learning_rates(0)) > 0 and min(plan.learning_rates(plan.steps)) > 0
+
+
 def test_schedules() -> None:
     plan = replace(PLAN, delay=0.1, last=0.01)
     assert (plan.stage_starts, plan.steps) == ((60,), 150)
