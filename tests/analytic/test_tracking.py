@@ -19,7 +19,7 @@ from scattering_scenes import PLACE, aimed, assert_same_images, cases, close_up,
 import scenes
 from mivol.experiments.script import explain
 from mivol.transport.estimators.flights import tracking
-from mivol.transport.estimators.flights.free_flight import FreeFlight
+from mivol.transport.estimators.flights.free_flight import FreeFlight, _channel_probabilities
 from mivol.transport.estimators.flights.tracking import (
     LOOKUP_RATE,
     delta_tracking,
@@ -118,6 +118,12 @@ def test_estimates_have_the_exact_mean(name):
 def test_a_scale_counts():
     found, T = estimates(grid(FIELDS["rough"]()), scale=0.4)
     assert_means(found.mean(axis=1), T, T * (1 - T), REPEATS)
+
+
+def test_channels_are_drawn_by_their_throughput(variant_rgb: str) -> None:
+    """Alike on a path without throughput, whose derivative by an albedo of 0 is not 0."""
+    found = [[float(p[0]) for p in _channel_probabilities(mi.Spectrum(beta))] for beta in ([3.0, 1.0, 0.0], [0.0] * 3)]
+    np.testing.assert_allclose(found, [[3 / 4, 1 / 4, 0], [1 / 3] * 3], rtol=1e-6)
 
 
 def test_nothing_is_noisy_where_nothing_varies():

@@ -257,7 +257,7 @@ def test_tank_in_glass(tmp_path, glass, variant_rgb):
     """
     truth = np.array([0.154, 0.183, 0.929])
     given = SimpleNamespace(
-        output=tmp_path, dilutions=[0.1, 0.2], size=12, photo_spp=4096, max_depth=-1, iterations=2, rounds=4, seed=0
+        output=tmp_path, dilutions=[0.1, 0.2], size=12, photo_spp=4096, max_depth=-1, iterations=4, rounds=4, seed=0
     )
     photographs = glass["photographs_of"](glass["XML"], truth, 2, 0, given)
     sought = np.array([np.log(truth[0]), np.log(truth[1]), np.arctanh(truth[2])])

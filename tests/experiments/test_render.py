@@ -25,6 +25,21 @@ def test_render_in_passes_is_the_mean(variant_rgb, folder: Path, monkeypatch: py
     assert not np.array_equal(split, once)
 
 
+@pytest.mark.parametrize("count", [2, 3])
+def test_each_pass_has_a_seed_of_its_own(variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """Passes with one seed would be one image, as noisy as a single pass."""
+    parts = []
+
+    def render_black(given):
+        parts.extend(given)
+        return ((np.zeros((6, 8, 4)), 0.0) for _ in given)
+
+    monkeypatch.setattr(render, "SAMPLES_PER_PASS", 3 * 48)
+    render.render_image(mi.load_file(str(folder / "scene.xml")), 0, spp=3 * count, passes=render_black)
+    assert [spp for _, spp in parts] == [3] * count
+    assert len({seed for seed, _ in parts}) == count
+
+
 @pytest.mark.parametrize("colours", ["luminance", "rgb", "rgba"])
 @pytest.mark.parametrize("inside", [0, 1, 2])
 def test_channels_of_integrators_inside_aov_have_names(variant_rgb, colours: str, inside: int) -> None:
