@@ -87,6 +87,12 @@ def test_the_largest_model_is_kept_and_the_rest_is_named(
     assert "poses in it already (COLMAP)" in capsys.readouterr().err
 
 
+def test_an_empty_folder_of_models_is_filled(folder: Path, job: dict) -> None:
+    (folder / "sparse").mkdir()
+    poses.find_poses(folder)
+    assert (folder / "sparse" / "0" / "images.bin").is_file()
+
+
 def test_a_lens_by_exif_is_a_camera(folder: Path, job: dict) -> None:
     set_exif(folder / "images" / "near" / "d.jpg", {0x010F: "Maker", 0x920A: 4.2})
     set_exif(folder / "images" / "near" / "e.jpg", {0x010F: "Maker", 0x920A: 4.2})
