@@ -20,6 +20,9 @@ from mivol.photos.lens import LARGEST_TERM, Fisheye, Lens, Panorama, distort, un
 PIXELS_LOST = 0.1
 """Largest shift of an image corner by an inexact rotation matrix [pixel]."""
 
+ROUNDING = 1e-5
+"""Largest deviation of a transform's last row from 0, 0, 0, 1: ARKit multiplies matrices of float32, each within 1e-7."""
+
 FLIP = np.array([1.0, -1.0, -1.0])
 """Signs that convert OpenCV's camera axes (y down, z forward) to the axes here, and back."""
 
@@ -208,7 +211,7 @@ def _check_pose(matrix: np.ndarray, K: np.ndarray, size: tuple[int, int], name: 
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         found = f"a transform of shape {pose.shape}" if pose.shape != (4, 4) else "a transform with NaN or infinity"
         raise refusal(name, found, "4 x 4 finite numbers", "correct it in the file of cameras")
-    if not np.array_equal(pose[3], (0, 0, 0, 1)):
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > ROUNDING:
         raise refusal(name, f"a transform with last row {pose[3].tolist()}", "0, 0, 0, 1", "correct it in the file of cameras")
     u, _, vt = np.linalg.svd(pose[:3, :3])
     error = np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max()
@@ -221,7 +224,7 @@ def _check_pose(matrix: np.ndarray, K: np.ndarray, size: tuple[int, int], name: 
             f"columns of length 1 at right angles to {allowed:.1g}, right-handed",
             "remove scale, shear and mirroring",
         )
-    pose[:3, :3] = u @ vt
+    pose[:3, :3], pose[3] = u @ vt, (0, 0, 0, 1)
     return pose
 
 

@@ -242,7 +242,8 @@ def write_export(folder: Path, kind: str, n: int = 3) -> Path:
             table |= {"K": [20, 0, 0, 0, 21, 0, 11, 9, 1], "poses": [*table["poses"], row]}
             file.write_text(json.dumps(table))
         else:
-            table = {"intrinsics": [20, 0, 11, 0, 21, 9, 0, 0, 1], "cameraPoseARFrame": pose.ravel().tolist()}
+            rounded = [*pose.ravel()[:-1], 0.99999988079071045]  # a product of matrices of float32, as the app writes it
+            table = {"intrinsics": [20, 0, 11, 0, 21, 9, 0, 0, 1], "cameraPoseARFrame": rounded}
             (folder / f"frame_{number}.json").write_text(json.dumps(table))
             (folder / "frame_90.json").write_text(json.dumps(table))  # a pose without a photograph
     return folder
