@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterator
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,13 @@ DOUBTFUL = 0.7
 FEWEST = 15
 """Common points of a pair with an overlap (COLMAP's ``min_num_inliers``)."""
 
+SURE = 50
+"""Common points of a pair from which its geometry counts as sure; fewer may agree by chance."""
+
+AGREES = 10.0
+"""Largest distance of common points from the geometry of the poses [pixel]; from that of their own pair it is 4 (COLMAP's
+``max_error``)."""
+
 
 def say(**facts: object) -> None:
     """Print facts as a line of JSON."""
@@ -73,7 +81,7 @@ def run(job: dict) -> None:
     options.random_seed = 0
     together = Path(job["models"]) / "together"
     together.mkdir()
-    found = write_models(pycolmap.global_mapping(database, images, together, options), together, job["aliases"])
+    found = write_models(pycolmap, pycolmap.global_mapping(database, images, together, options), together, job)
     posed, _ = rate(found)
     if posed < sum(map(len, job["names"])) or max(model["error"] for model in found) > DOUBTFUL:
         say(stage=f"{posed} photographs have poses; poses one by one")
@@ -81,7 +89,7 @@ def run(job: dict) -> None:
         options.random_seed = 0
         apart = Path(job["models"]) / "one-by-one"
         apart.mkdir()
-        others = write_models(pycolmap.incremental_mapping(database, images, apart, options), apart, job["aliases"])
+        others = write_models(pycolmap, pycolmap.incremental_mapping(database, images, apart, options), apart, job)
         found = max(found, others, key=rate)
     say(models=found)
 
@@ -175,9 +183,7 @@ def describe_matches(pycolmap: Any, database: Path, aliases: dict[str, str]) -> 
         images = {image.image_id: image for image in opened.read_all_images()}
         places = {number: opened.read_keypoints(number)[:, :2] for number in images}
         sizes = {number: opened.read_camera(image.camera_id) for number, image in images.items()}
-        for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
-            one, other = pycolmap.pair_id_to_image_pair(pair)
-            matches = np.asarray(geometry.inlier_matches).reshape(-1, 2)
+        for one, other, matches, geometry in read_pairs(pycolmap, opened):
             for a, b in ((one, other), (other, one)):
                 name, partner = (aliases.get(images[number].name, images[number].name) for number in (a, b))
                 if len(matches) > facts["best"].get(name, ("", -1))[1]:
@@ -190,6 +196,47 @@ def describe_matches(pycolmap: Any, database: Path, aliases: dict[str, str]) -> 
             facts["still"] += bool(shift < STILL)
             facts["turned"] += bool(shift > TURN and geometry.config in flat and is_turn(np.asarray(geometry.H), size))
     return facts
+
+
+def read_pairs(pycolmap: Any, database: Any) -> Iterator[tuple[int, int, np.ndarray, Any]]:
+    """Numbers of two photographs, the indices (N, 2) of their common points, and the relation between both views."""
+    for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
+        yield *pycolmap.pair_id_to_image_pair(pair), np.asarray(geometry.inlier_matches).reshape(-1, 2), geometry
+
+
+def count_contradictions(pycolmap: Any, database: Path, model: Any) -> tuple[int, int]:
+    """Pairs of at least ``SURE`` common points that contradict the poses of a model, and all such pairs.
+
+    A pair contradicts the poses if the median distance of its points from the geometry of the poses is above ``AGREES``: parts
+    that look alike were taken for one part, or the poses are wrong.
+    """
+    against = count = 0
+    with pycolmap.Database.open(database) as opened:
+        for one, other, matches, _ in read_pairs(pycolmap, opened):
+            views = [model.images[number] for number in (one, other) if number in model.images]
+            if len(matches) < SURE or len(views) < 2 or not all(view.has_pose for view in views):
+                continue
+            relative = views[1].cam_from_world() * views[0].cam_from_world().inverse()
+            places = [opened.read_keypoints(number)[:, :2] for number in (one, other)]
+            rays = [view.camera.cam_from_img(place[rows]) for view, place, rows in zip(views, places, matches.T, strict=True)]
+            distances = epipolar_distances(*rays, np.asarray(relative.rotation.matrix()), np.asarray(relative.translation))
+            count += 1
+            against += bool(np.median(distances) * views[0].camera.mean_focal_length() > AGREES)
+    return against, count
+
+
+def epipolar_distances(one: np.ndarray, other: np.ndarray, rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Distances (N,) of points of two images from a relative pose, to first order (Hartley and Zisserman 2004, 11.4.3).
+
+    Args:
+        one, other: points (N, 2) in units of the focal length.
+        rotation, shift: (3, 3) and (3,), from the first camera to the second, as in OpenCV.
+    """
+    x, y = (np.column_stack([points, np.ones(len(points))]) for points in (one, other))
+    essential = np.cross(shift, rotation, axisb=0, axisc=0)
+    lines, back = x @ essential.T, y @ essential
+    size = np.sqrt((lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1))
+    return np.abs((y * lines).sum(axis=1)) / np.maximum(size, 1e-12)
 
 
 def is_turn(homography: np.ndarray, size: tuple[int, int]) -> bool:
@@ -206,18 +253,20 @@ def is_turn(homography: np.ndarray, size: tuple[int, int]) -> bool:
     return min(ratios) < EQUAL
 
 
-def write_models(models: dict, place: Path, aliases: dict[str, str]) -> list[dict]:
+def write_models(pycolmap: Any, models: dict, place: Path, job: dict) -> list[dict]:
     """Write models to folders of ``place``; return the facts of each."""
     found = []
     for number, model in models.items():
         folder = place / str(number)
         folder.mkdir(exist_ok=True)
         for image in model.images.values():
-            image.name = aliases.get(image.name, image.name)
+            image.name = job["aliases"].get(image.name, image.name)
         model.write(folder)
         named = sorted(image.name for image in model.images.values() if image.has_pose)
         error, points = model.compute_mean_reprojection_error(), model.num_points3D()
-        found.append({"folder": str(folder), "names": named, "error": error, "points": points, "cameras": model.num_cameras()})
+        against = count_contradictions(pycolmap, Path(job["database"]), model)
+        facts = {"folder": str(folder), "names": named, "error": error, "points": points, "against": against}
+        found.append(facts | {"cameras": model.num_cameras()})
     return found
 
 

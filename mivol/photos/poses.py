@@ -42,6 +42,9 @@ ODD = 0.3
 MIRRORED = (2, 4, 5, 7)
 """Orientations of EXIF with a mirror image, as some front cameras write them."""
 
+AGAINST = 0.02
+"""Share of the pairs that contradict the poses, above which a warning speaks of parts that look alike."""
+
 FULL = 2**24
 """Free space below which COLMAP is said to have filled the disk [byte]."""
 
@@ -74,6 +77,7 @@ class Poses:
         others: photographs of each further model, which has no part in common with the first.
         best: photograph without a pose -> the photograph with the most points in common with it, and their number.
         left_out: damaged photographs, and copies of others.
+        against: pairs of photographs whose common points contradict the poses, and all pairs with many common points.
     """
 
     folder: Path
@@ -85,6 +89,7 @@ class Poses:
     others: tuple[tuple[str, ...], ...] = ()
     best: Mapping[str, tuple[str, int]] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()
+    against: tuple[int, int] = (0, 0)
 
     def describe(self) -> str:
         """Describe the result in a paragraph."""
@@ -93,6 +98,8 @@ class Poses:
             f"{self.folder}: {len(self.posed)} of {total} photographs have poses, {self.points} points, {self.cameras} "
             f"camera{'s' * (self.cameras != 1)}, reprojection error {self.error:.2f} pixels"
         ]
+        if doubt := self.describe_doubt():
+            lines.append(doubt)
         if self.others:
             sizes = ", ".join(str(len(names)) for names in self.others)
             first = self.others[0][0]
@@ -104,6 +111,17 @@ class Poses:
         if unposed := [name for name in self.unposed if name not in apart]:
             lines.append(f"without a pose: {name_first(list(map(self._name_unposed, unposed)))}; {AGAIN}")
         return "\n".join(lines)
+
+    def describe_doubt(self) -> str:
+        """Say that pairs contradict the poses, and what to photograph; empty if at most ``AGAINST`` of them do."""
+        against, count = self.against
+        if against <= AGAINST * count:
+            return ""
+        return (
+            f"{against} of {count} pairs of photographs contradict these poses, which happens if parts look alike: if the "
+            "cameras do not stand where you walked, put something different beside each side of the subject, and photograph "
+            "it again"
+        )
 
     def _name_unposed(self, name: str) -> str:
         """A photograph without a pose, with the reason that its matches show."""
@@ -342,4 +360,6 @@ def _keep(folder: Path, models: list[dict[str, Any]], names: list[str], matches:
     rest = tuple(name for name in names if name not in set(posed))
     apart = tuple(tuple(model["names"]) for model in others)
     partners = {name: tuple(matches.get("best", {}).get(name, ("", 0))) for name in rest}
-    return Poses(target, posed, rest, best["error"], best["points"], best["cameras"], apart, partners)
+    return Poses(
+        target, posed, rest, best["error"], best["points"], best["cameras"], apart, partners, against=tuple(best["against"])
+    )

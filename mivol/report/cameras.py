@@ -475,13 +475,16 @@ def write_poses_page(folder: Path, poses: Poses) -> Path:
         ("points", str(poses.points)),
         ("cameras (lens and size)", str(poses.cameras)),
         ("without a pose", ", ".join(poses.unposed) or "none"),
+        ("pairs of photographs that contradict the poses", f"{poses.against[0]} of {poses.against[1]}"),
         ("damaged, or copies of others", ", ".join(poses.left_out) or "none"),
         ("in separate models", ", ".join(", ".join(names) for names in poses.others) or "none"),
     ]
     table = "".join(f"<tr><th align=left>{html.escape(head)}</th><td>{html.escape(cell)}</td></tr>" for head, cell in rows)
+    doubt = html.escape(poses.describe_doubt())
     text = (
         f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>Poses of {html.escape(folder.name)}</title>'
         f"<style>{PAGE_STYLE}</style></head><body><h1>Poses of {html.escape(folder.name)}</h1><table>{table}</table>"
+        f"<p><b>{doubt}</b></p>"
         "<p>The cameras, with the box of a fit. An error above 1.5 pixels is a sign of blur, or of a subject that moved. The "
         "cameras should stand where you took the photographs. If they do not, sides of the subject that look alike were taken "
         "for the same side: put things that differ beside each, and photograph it again.</p>"

@@ -57,7 +57,8 @@ def job(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict:
         models = []
         for k, names in enumerate((["near/e.jpg"], ["a.jpg", "b.png", "near/d.jpg"])):
             model = write_colmap(tmp_path / f"model{k}") / "sparse" / "0"
-            models.append({"folder": str(model), "names": names, "error": 0.5, "points": 7, "cameras": 1})
+            facts = {"error": 0.5, "points": 7, "cameras": 1, "against": asked.get("against", (0, 3))}
+            models.append({"folder": str(model), "names": names, **facts})
         return models, asked.get("matches", {})
 
     monkeypatch.setattr(poses, "_run", run)
@@ -361,6 +362,32 @@ def test_poses_are_found_one_by_one_if_photographs_are_left_out_or_points_disagr
 def test_a_photograph_of_another_thing_is_named() -> None:
     said = poses.Poses(Path("m"), ("a", "b", "c"), ("d", "e"), 0.5, 9, 1, best={"d": ("a", 0), "e": ("b", 80)}).describe()
     assert "without a pose: d (shows no part of another photograph), e; " in said
+
+
+@pytest.mark.parametrize(("against", "is_said"), [(12, False), (13, True)])
+def test_poses_that_pairs_contradict_are_doubted(tmp_path: Path, folder: Path, job: dict, against: int, is_said: bool) -> None:
+    """More than ``AGAINST`` of 630 pairs are said on the terminal and on the page, with what to photograph."""
+    job["against"] = (against, 630)
+    found = poses.find_poses(folder)
+    page = cameras.write_poses_page(write_colmap(tmp_path / "posed"), found).read_text(encoding="utf-8")
+    for text in (found.describe(), page):
+        assert (f"{against} of 630 pairs of photographs contradict these poses" in text) == is_said
+    assert f"<td>{against} of 630</td>" in page
+
+
+def test_pairs_contradict_a_camera_on_the_wrong_side(tmp_path: Path) -> None:
+    """Ten cameras around points, by pycolmap: of 45 pairs none contradicts, but the nine of a camera that is moved."""
+    pycolmap = pytest.importorskip("pycolmap")
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_points3D = 60
+    pycolmap.set_random_seed(0)
+    with pycolmap.Database.open(tmp_path / "db") as database:
+        model = pycolmap.synthesize_dataset(options, database)
+    assert colmap_process.count_contradictions(pycolmap, tmp_path / "db", model) == (0, 45)
+    first = next(iter(model.frames.values()))
+    turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, 0.2, 0, 1])), np.zeros(3))
+    first.rig_from_world = turn * first.rig_from_world
+    assert colmap_process.count_contradictions(pycolmap, tmp_path / "db", model) == (9, 45)
 
 
 def test_a_full_disk_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
