@@ -1,13 +1,14 @@
 """Poses of photographs by COLMAP, as a program of its own: ``python colmap_process.py JOB.json``.
 
-pycolmap brings its own zlib, which breaks Pillow's PNG in the same process. So nothing of mivol imports this file.
+pycolmap brings its own zlib, which breaks Pillow's PNG in the same process. So mivol imports constants of this file alone.
 
 Pairs. Of a short list of photographs all pairs are matched. Of a long one or a video (``sequential``), photographs are matched
 with neighbours in the order of names and with photographs that look alike (:func:`find_alike`), which close a walk around it.
 
 Global structure from motion (Pan et al. 2024) comes first. It averages the rotations of all photographs and finds all positions
-together, so errors do not add up along a chain of photographs. If it leaves out photographs, or has a doubtful error, poses are
-also found one by one (Schönberger and Frahm 2016), and the better model is kept (:func:`rate`).
+together, so errors do not add up along a chain of photographs. If it leaves out photographs, has a doubtful error, or pairs of
+photographs contradict it, poses are also found one by one (Schönberger and Frahm 2016), and the better model is kept
+(:func:`rate`).
 
 The job names ``images`` (folder), ``names`` (groups of photographs, one camera for each group), ``order`` (all photographs),
 ``masks`` (folder, or ""), ``database`` and ``models`` (where to write), ``sequential``, ``longest`` (edge of a photograph in
@@ -51,12 +52,13 @@ DOUBTFUL = 0.7
 FEWEST = 15
 """Common points of a pair with an overlap (COLMAP's ``min_num_inliers``)."""
 
-SURE = 50
-"""Common points of a pair from which its geometry counts as sure; fewer may agree by chance."""
+SURE, OFF, SPREAD = 100, 10.0, 0.1
+"""Common points of a pair that contradict the poses: their least number, their least distance from the geometry of the poses
+[pixel], and their least spread over the diagonal of a photograph. Their distance from the geometry of the pair is at most 4
+pixels (COLMAP's ``max_error``). A small part that is there twice has less spread."""
 
-AGREES = 10.0
-"""Largest distance of common points from the geometry of the poses [pixel]; from that of their own pair it is 4 (COLMAP's
-``max_error``)."""
+AGAINST = 0.02
+"""Share of the pairs with ``SURE`` common points that contradict the poses, above which the poses are doubtful."""
 
 
 def say(**facts: object) -> None:
@@ -82,8 +84,8 @@ def run(job: dict) -> None:
     together = Path(job["models"]) / "together"
     together.mkdir()
     found = write_models(pycolmap, pycolmap.global_mapping(database, images, together, options), together, job)
-    posed, _ = rate(found)
-    if posed < sum(map(len, job["names"])) or max(model["error"] for model in found) > DOUBTFUL:
+    posed = max((len(model["names"]) for model in found), default=0)
+    if posed < sum(map(len, job["names"])) or any(is_doubtful(model) for model in found):
         say(stage=f"{posed} photographs have poses; poses one by one")
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed = 0
@@ -207,8 +209,7 @@ def read_pairs(pycolmap: Any, database: Any) -> Iterator[tuple[int, int, np.ndar
 def count_contradictions(pycolmap: Any, database: Path, model: Any) -> tuple[int, int]:
     """Pairs of at least ``SURE`` common points that contradict the poses of a model, and all such pairs.
 
-    A pair contradicts the poses if the median distance of its points from the geometry of the poses is above ``AGREES``: parts
-    that look alike were taken for one part, or the poses are wrong.
+    Parts that look alike and are taken for one part make such pairs.
     """
     against = count = 0
     with pycolmap.Database.open(database) as opened:
@@ -217,12 +218,19 @@ def count_contradictions(pycolmap: Any, database: Path, model: Any) -> tuple[int
             if len(matches) < SURE or len(views) < 2 or not all(view.has_pose for view in views):
                 continue
             relative = views[1].cam_from_world() * views[0].cam_from_world().inverse()
-            places = [opened.read_keypoints(number)[:, :2] for number in (one, other)]
-            rays = [view.camera.cam_from_img(place[rows]) for view, place, rows in zip(views, places, matches.T, strict=True)]
+            places = [opened.read_keypoints(number)[rows, :2] for number, rows in zip((one, other), matches.T, strict=True)]
+            rays = [view.camera.cam_from_img(place) for view, place in zip(views, places, strict=True)]
             distances = epipolar_distances(*rays, np.asarray(relative.rotation.matrix()), np.asarray(relative.translation))
+            is_off = distances * views[0].camera.mean_focal_length() > OFF
+            sizes = [np.hypot(view.camera.width, view.camera.height) for view in views]
             count += 1
-            against += bool(np.median(distances) * views[0].camera.mean_focal_length() > AGREES)
+            against += is_spread([place[is_off] / size for place, size in zip(places, sizes, strict=True)])
     return against, count
+
+
+def is_spread(places: list[np.ndarray]) -> bool:
+    """Whether points (N, 2) of both photographs, over their diagonals, are ``SURE`` and have a spread of ``SPREAD``."""
+    return len(places[0]) >= SURE and all(np.linalg.norm(place.std(axis=0)) >= SPREAD for place in places)
 
 
 def epipolar_distances(one: np.ndarray, other: np.ndarray, rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
@@ -270,9 +278,23 @@ def write_models(pycolmap: Any, models: dict, place: Path, job: dict) -> list[di
     return found
 
 
-def rate(found: list[dict]) -> tuple[int, int]:
-    """Photographs of the largest model, and its points: with wrong poses, fewer matches agree on a point."""
-    return max(((len(model["names"]), model["points"]) for model in found), default=(0, 0))
+def is_doubtful(model: dict) -> bool:
+    """Whether a model has a large reprojection error, or pairs that contradict it."""
+    return model["error"] > DOUBTFUL or share_against(model) > AGAINST
+
+
+def share_against(model: dict) -> float:
+    """Share of the pairs with many common points that contradict a model."""
+    against, count = model["against"]
+    return against / max(count, 1)
+
+
+def rate(found: list[dict]) -> tuple[float, int]:
+    """Photographs of the largest model times the share of pairs that agree with it, and its points.
+
+    With wrong poses, fewer matches agree on a point.
+    """
+    return max(((len(model["names"]) * (1 - share_against(model)), model["points"]) for model in found), default=(0, 0))
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from typing import Any
 from mivol.errors import MivolError
 from mivol.files.source import refusal
 from mivol.photos.colmap import find_model
+from mivol.photos.colmap_process import AGAINST
 from mivol.photos.listing import find_mask, list_photographs, name_first, split_numbers
 from mivol.photos.photo_file import is_damaged, read_lens_facts, read_mask, read_photo_header, write_upright
 from mivol.photos.survey import find_format
@@ -41,9 +42,6 @@ ODD = 0.3
 
 MIRRORED = (2, 4, 5, 7)
 """Orientations of EXIF with a mirror image, as some front cameras write them."""
-
-AGAINST = 0.02
-"""Share of the pairs that contradict the poses, above which a warning speaks of parts that look alike."""
 
 FULL = 2**24
 """Free space below which COLMAP is said to have filled the disk [byte]."""

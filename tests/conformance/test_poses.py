@@ -308,23 +308,27 @@ def test_pycolmap_is_asked_for(folder: Path, monkeypatch: pytest.MonkeyPatch) ->
         ((0, 0.5, 0), (4, 0.5, 9), 9),
         ((5, 0.9, 7), (5, 0.4, 9), 9),
         ((5, 0.9, 7), (5, 0.8, 6), 7),
+        ((5, 0.5, 7, 2), None, 7),
+        ((5, 0.5, 7, 3), (5, 0.5, 6, 0), 6),
+        ((5, 0.5, 7, 3), (4, 0.5, 9, 0), 7),
+        ((5, 0.5, 7, 30), (4, 0.5, 6, 0), 6),
     ],
 )
 def test_poses_are_found_one_by_one_if_photographs_are_left_out_or_points_disagree(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-    together: tuple[int, float, int],
-    one_by_one: tuple[int, float, int] | None,
+    together: tuple[float, ...],
+    one_by_one: tuple[float, ...] | None,
     kept: int,
 ) -> None:
-    """Photographs, reprojection error and points of the models, and the points of the model that is kept.
+    """Photographs, error, points and contradicting pairs (of 100) of the models, and the points of the model that is kept.
 
-    If all photographs have poses of a small error, the second search does not run.
+    If all photographs have poses of a small error that the pairs agree with, the second search does not run.
     """
 
-    def make(found: tuple[int, float, int] | None) -> Callable[..., dict]:
-        count, error, points = found or (None, 0.0, 0)
+    def make(found: tuple[float, ...] | None) -> Callable[..., dict]:
+        count, error, points, against = (*(found or (None, 0.0, 0)), 0)[:4]
 
         def search(database: Path, images: Path, models: Path, options: object) -> dict:
             assert count is not None and options.random_seed == 0 and models.is_dir()
@@ -334,11 +338,13 @@ def test_poses_are_found_one_by_one_if_photographs_are_left_out_or_points_disagr
                 compute_mean_reprojection_error=lambda: error,
                 num_points3D=lambda: points,
                 num_cameras=lambda: 1,
+                against=(against, 100),
             )
             return {0: model} if count else {}
 
         return search
 
+    monkeypatch.setattr(colmap_process, "count_contradictions", lambda pycolmap, database, model: model.against)
     library = MagicMock(global_mapping=make(together), incremental_mapping=make(one_by_one))
     monkeypatch.setitem(sys.modules, "pycolmap", library)
     (tmp_path / "models").mkdir()
@@ -379,7 +385,7 @@ def test_pairs_contradict_a_camera_on_the_wrong_side(tmp_path: Path) -> None:
     """Ten cameras around points, by pycolmap: of 45 pairs none contradicts, but the nine of a camera that is moved."""
     pycolmap = pytest.importorskip("pycolmap")
     options = pycolmap.SyntheticDatasetOptions()
-    options.num_points3D = 60
+    options.num_points3D = 120
     pycolmap.set_random_seed(0)
     with pycolmap.Database.open(tmp_path / "db") as database:
         model = pycolmap.synthesize_dataset(options, database)
@@ -388,6 +394,13 @@ def test_pairs_contradict_a_camera_on_the_wrong_side(tmp_path: Path) -> None:
     turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, 0.2, 0, 1])), np.zeros(3))
     first.rig_from_world = turn * first.rig_from_world
     assert colmap_process.count_contradictions(pycolmap, tmp_path / "db", model) == (9, 45)
+
+
+@pytest.mark.parametrize(("count", "sizes", "expected"), [(100, (0.3, 0.3), 1), (99, (0.3, 0.3), 0), (100, (0.3, 0.2), 0)])
+def test_a_small_part_that_is_there_twice_contradicts_nothing(count: int, sizes: tuple[float, float], expected: bool) -> None:
+    """A line of a size has a spread of its size over the square root of 12."""
+    line = np.stack([np.linspace(0, 1, count), np.zeros(count)], axis=1) * np.sqrt(12)
+    assert colmap_process.is_spread([size / 2.9 * line for size in sizes]) == expected
 
 
 def test_a_full_disk_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
