@@ -4,7 +4,7 @@
     scripts/on_a_gpu --only tests steps       some of the parts
     scripts/on_a_gpu --only samples chair_hash chair_nerf      hash grids and NeRFs, within 16 minutes more
     scripts/on_a_gpu --variant llvm_ad_rgb    the same parts on the processor
-    scripts/on_a_gpu --variant llvm_ad_rgb --quick --only samples chair_hash chair_nerf     a rehearsal in a minute
+    scripts/on_a_gpu --variant llvm_ad_rgb --quick    a rehearsal in small sizes, in minutes (tests take 4)
 
 Each part is a process of its own with a limit of time, so that a part that fails, waits or kills its process costs the others
 nothing. What was printed lies in the folder as PART.log. Fits need public data (``mivol fetch chair``); without it they are
@@ -38,6 +38,7 @@ class Part:
         command: arguments of Python, from the variant and the folder of results.
         needs: data set without which the part is left out, a folder below ``MIVOL_DATA``; empty for none.
         is_more: whether the part runs only if it is named.
+        amounts: options of the command, or the effort of a fit, that a rehearsal leaves out.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Part:
     command: Callable[[str, Path], list[str]]
     needs: str = ""
     is_more: bool = False
+    amounts: tuple[str, ...] = ()
 
 
 def bench(study: str, *more: str) -> Callable[[str, Path], list[str]]:
@@ -53,11 +55,24 @@ def bench(study: str, *more: str) -> Callable[[str, Path], list[str]]:
     return lambda variant, out: ["-m", "mivol", "bench", study, "--variant", variant, "--out", str(out / folder), *more]
 
 
-def fit(preset: str, kind: str) -> Callable[[str, Path], list[str]]:
-    """The command of a fit of the chair's photographs, judged by its held-out views."""
+RECORDING = (
+    "import sys; from mivol.scene import scene_state; from mivol.cli import main;"
+    "scene_state.RECORDED_BACK_ENDS += ('cuda',); sys.exit(main(sys.argv[1:]))"
+)
+"""Program of mivol that records renders on a GPU too, where Dr.Jit 1.5 may end the process."""
+
+
+def record(variant: str, out: Path) -> list[str]:
+    """The command of steps with recordings on a GPU."""
+    given = "--variant", variant, "--out", str(out / "steps_recorded"), "--only", "images,gradients", "--scenes", "tutorial"
+    return ["-c", RECORDING, "bench", "steps", *given]
+
+
+def fit(kind: str) -> Callable[[str, Path], list[str]]:
+    """The command of a fit of the chair's photographs, judged by its test views."""
     chair = str(data_folder() / "multiview" / "chair")
     return lambda variant, out: [
-        *("-m", "mivol", "optimize", chair, "--as", kind, "--preset", preset, "--set", f"variant={variant}"),
+        *("-m", "mivol", "optimize", chair, "--as", kind, "--set", f"variant={variant}", "--set", "photos.judged=test"),
         *("-o", str(out / f"chair_{kind}")),
     ]
 
@@ -67,8 +82,9 @@ def data_folder() -> Path:
     return Path(os.environ.get("MIVOL_DATA", ROOT.parent / "shared" / "data"))
 
 
+CHAIR = "multiview/chair"
 PARTS = (
-    Part("doctor", 60, lambda variant, out: ["-m", "mivol", "doctor"]),
+    Part("doctor", 20, lambda variant, out: ["-m", "mivol", "doctor"]),
     Part(
         "tests",
         240,
@@ -85,21 +101,37 @@ PARTS = (
             str(ROOT / "tests"),
         ],
     ),
-    Part("steps", 60, bench("steps", "--scenes", "tutorial", "jade_null_sun", "--sides", "16", "256", "--spp", "1", "16")),
-    Part("images", 120, bench("multiple_scattering", "--only", "smoke", "--max-pixels", "256")),
-    Part("gaussians", 60, bench("points", "--only", "clouds")),
-    Part("chair_gaussians", 100, fit("gpu", "gaussians"), "multiview/chair"),
-    Part("chair_grid", 80, fit("gpu", "grid"), "multiview/chair"),
+    Part(
+        "steps",
+        40,
+        bench("steps"),
+        amounts=("--scenes", "tutorial", "jade_null_sun", "--sides", "16", "256", "--spp", "1", "16"),
+    ),
+    Part("recordings", 40, record, amounts=("--sides", "16", "256")),
+    Part("loops", 50, bench("steps", "--only", "loops"), amounts=("--loop-scenes", "tutorial", "smoke_on_floor")),
+    Part(
+        "gradients",
+        40,
+        bench("steps", "--only", "gradients", "--scenes", "tutorial", "tutorial_sun"),
+        amounts=("--sides", "64", "--spp", "512"),
+    ),
+    Part(
+        "images", 40, bench("multiple_scattering", "--only", "smoke"), amounts=("--side", "256", "--spp", "64", "--levels", "1")
+    ),
+    Part("gaussians", 30, bench("points", "--only", "clouds")),
+    # An eighth of the published steps.
+    Part("chair_gaussians", 120, fit("gaussians"), CHAIR, amounts=("--preset", "gpu", "--set", "gaussians.effort=0.125")),
+    Part("chair_grid", 100, fit("grid"), CHAIR, amounts=("--preset", "gpu")),
     Part("samples", 60, bench("gpu", "--only", "samples"), is_more=True),
-    Part("chair_hash", 300, bench("gpu", "--only", "hash"), "multiview/chair", is_more=True),
-    Part("chair_nerf", 600, bench("gpu", "--only", "nerf"), "multiview/chair", is_more=True),
+    Part("chair_hash", 300, bench("gpu", "--only", "hash"), CHAIR, is_more=True),
+    Part("chair_nerf", 600, bench("gpu", "--only", "nerf"), CHAIR, is_more=True),
 )
 """The parts in their order. The limits of those that run without being named sum to 12 minutes, of the others to 16."""
 
 
 QUICK = "; a rehearsal in small sizes, whose figures mean nothing"
 
-LAST_LINES = 3
+LAST_LINES = 9
 """Lines kept of a part without a table."""
 
 
@@ -121,11 +153,16 @@ class Result:
 
 
 def run_part(part: Part, variant: str, out: Path, quick: bool = False) -> Result:
-    """Run a part, and keep what it prints in a file; ``quick``: studies in the small sizes of a rehearsal."""
+    """Run a part, and keep what it prints in a file; ``quick``: studies and fits in the small sizes of a rehearsal."""
     if part.needs and not (data_folder() / part.needs).is_dir():
         return Result(part.name, "left out", lines=[f"{part.needs} was not found in {data_folder()}: set MIVOL_DATA"])
     log, start, command = out / f"{part.name}.log", time.perf_counter(), part.command(variant, out)
-    command += ["--quick"] if quick and "bench" in command else []
+    if not quick:
+        command += part.amounts
+    elif "bench" in command:
+        command += ["--quick"]
+    elif "optimize" in command:
+        command += ["--preset", "tiny"]
     with log.open("w") as file:
         child = subprocess.Popen(
             [sys.executable, *command],

@@ -10,6 +10,7 @@ import pytest
 from conftest import ON_A_GPU
 from script_modules import load
 
+from mivol.bench.harness.catalogue import load_study
 from mivol.bench.studies.gpu import STUDY, GpuSize
 
 report = load("gpu_report")
@@ -36,7 +37,7 @@ def test_parts_are_run_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
     states = {found["name"]: found["state"] for found in told["parts"]}
     assert states == {"table": "ok", "figures": "ok", "broken": "failed", "waiting": "out of time", "fit": "left out"}
     lines = {found["name"]: found["lines"] for found in told["parts"]}
-    assert (lines["table"], lines["figures"]) == (["| a | 1 |"], ["a: 1", "b: 2", "c: 3"])
+    assert (lines["table"], lines["figures"]) == (["| a | 1 |"], ["question?", "a: 1", "b: 2", "c: 3"])
     assert lines["broken"] == ["last words"] and "MIVOL_DATA" in lines["fit"][0]
     assert "| waiting | out of time | 1 |" in capsys.readouterr().out
     assert report.main(["--variant", "llvm_ad_rgb", "--out", str(tmp_path), "--only", "table"]) == 0
@@ -48,12 +49,17 @@ def test_a_rehearsal_asks_studies_for_small_sizes_and_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     echo = "import sys; print('|', *sys.argv[1:], '|')"
-    parts = [report.Part(name, 60, lambda variant, out, name=name: ["-c", echo, name]) for name in ("bench", "tests")]
+    names = "bench", "tests", "optimize"
+    parts = [report.Part(n, 60, lambda variant, out, n=n: ["-c", echo, n], amounts=("--large",)) for n in names]
     monkeypatch.setattr(report, "PARTS", parts)
     monkeypatch.setattr(report, "list_gpus", list)
     assert report.main(["--variant", "llvm_ad_rgb", "--out", str(tmp_path), "--quick"]) == 0
     said = capsys.readouterr().out
-    assert "| bench --quick |" in said and "| tests |" in said and "no GPU" in said and "figures mean nothing" in said
+    assert "| bench --quick |" in said and "| tests |" in said and "| optimize --preset tiny |" in said
+    assert "no GPU" in said and "figures mean nothing" in said and "--large" not in said
+    assert report.main(["--variant", "llvm_ad_rgb", "--out", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert all(f"| {name} --large |" in said for name in names) and "figures mean nothing" not in said
 
 
 def test_a_machine_without_a_gpu(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -74,3 +80,7 @@ def test_the_parts_take_12_minutes_and_their_tests_exist() -> None:
     for name, question in {"samples": "samples", "chair_hash": "hash", "chair_nerf": "nerf"}.items():
         assert studies[name][-2:] == ["--only", question] and question in STUDY.questions
     assert all((report.ROOT / "tests" / module).is_file() for module in ON_A_GPU)
+    # Each study takes the options of its part.
+    for part in report.PARTS:
+        if "bench" in (command := [*studies[part.name], *part.amounts]):
+            load_study(command[3]).parse(command[4:])

@@ -82,7 +82,7 @@ def find_dark_pixels(scene: mi.Scene) -> NDArray[np.bool_]:
 
 def measure(name: str, size: ContestSize) -> dict:
     """Compare the choice of the plan with light that is found by chance."""
-    scene = make_scene(name, size.max_pixels)
+    scene = make_scene(name, size.side or size.max_pixels)
     settings = {"type": "mivol", "max_depth": DEPTH, "rr_depth": 64}
     integrators = {choice: mi.load_dict(settings | {"media_light": choice}) for choice in ("auto", "met")}
     contest, counts = contest_images(scene, integrators, size), find_dark_pixels(scene)

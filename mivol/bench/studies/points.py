@@ -83,7 +83,9 @@ class PointsSize(Size):
     """Amount of work."""
 
     rounds: int = amount(9, 2, "warm calls of each contestant")
-    clouds: tuple[tuple[int, int], ...] = amount(((10_000, 200), (50_000, 400)), ((1000, 64),), "Gaussians and edges", tuple)
+    clouds: tuple[tuple[int, int], ...] = amount(
+        ((10_000, 200), (50_000, 400), (120_000, 800)), ((1000, 64),), "Gaussians and edges", tuple
+    )
     peer: tuple[int, int] = amount((10_000, 200), (500, 32), "Gaussians and edge of the image [pixels], for the peer")
     biker_side: int = amount(800, 64, "edge of the image of the biker [pixels]")
     substitute: int = amount(152_746, 2000, "Gaussians of the cloud in place of the biker")
@@ -204,6 +206,8 @@ def measure_clouds(size: PointsSize) -> dict:
     timings = race(contestants, size.rounds)
     walk = timings.pop("walk")
     rates = {name: report_scaled(t, pixels[name], walk, size) for name, t in timings.items()}
+    for name, row in rates.items():
+        say_row(name, milliseconds=1e3 * row["seconds_median"])
     return {"walk": walk.report(size.walk_side**2, "rays"), **rates}
 
 

@@ -85,6 +85,7 @@ class ContestSize(BudgetSize):
     """Amount of work of the contests of images."""
 
     max_pixels: int = amount(64, 16, "largest edge of an image [pixels]")
+    side: int = amount(0, doc="edge of all images [pixels]; 0: decided by the light and by max_pixels")
     fine_res: int = amount(256, 48, "voxels along an edge of the fine volumes")
     sparse_res: int = amount(512, 64, "voxels along an edge of the threads")
 
@@ -171,7 +172,7 @@ def contend(values: np.ndarray, light: Light, size: ContestSize, levels: tuple[i
     """
     if light.has_tails:
         size = replace(size, budget=LONGER * size.budget)
-    side = min(light.side, size.max_pixels)
+    side = size.side or min(light.side, size.max_pixels)
     scene = mi.load_dict(box_scene(values, side, light.albedo, **light.parts()))
     integrators = {name: make_integrator(name, light.depth) for name in ("mivol", *light.peers)}
     contest = contest_images(scene, integrators, size, levels)

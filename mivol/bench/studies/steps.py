@@ -21,8 +21,8 @@ records and compiles.
 chair: steps of the last stage of a fit of the chair (400 pixels, preset ``cpu`` with 128 nodes along the box, 65,536 rays a
 step), with their processor time.
 
-The scene ``tutorial`` is the smoke of the Mitsuba tutorial under a sky at depth 6; the other scenes are scenes of the study
-``everyday``.
+The scene ``tutorial`` is the smoke of the Mitsuba tutorial under a sky at depth 6; ``tutorial_sun`` is the same smoke with the
+phase function ``hg`` under a sun in a sky. The other scenes are scenes of the study ``everyday``.
 
 fits: a step of the fit loop with its optimizer, schedule, priors and record, on tiny models: the density of ``tutorial`` with
 Adam (also through ``prbvolpath``), a radiance field of 24^3 nodes (256 rays a step) and 256 Gaussians, both from photographs
@@ -40,7 +40,7 @@ import json
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -53,7 +53,7 @@ from mivol.bench.harness.contests import Stopwatch
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
 from mivol.bench.harness.study import AT_LEAST, AT_MOST, Bar, Question, Size, Study, amount, ask, judge, say_row
 from mivol.bench.photo_fits import PhotoSize, find_photographs, prepare_fit
-from mivol.bench.scenes import box_scene, smoke
+from mivol.bench.scenes import box_scene, smoke, sun_and_sky
 from mivol.bench.studies.everyday import EverydayScene, chosen_scenes
 from mivol.errors import MivolError
 from mivol.experiments.gaussian_fit import make_start_cloud
@@ -74,10 +74,15 @@ from mivol.splatting import Splatter
 from mivol.threads import run_child
 
 PEER = "prbvolpath"
-TUTORIAL = EverydayScene(
-    lambda side: box_scene(smoke().values, side, albedo=0.8), 6, 1.0, None, "box.interior_medium.sigma_t.data"
-)
+DENSITY_OF_BOX = "box.interior_medium.sigma_t.data"
+TUTORIAL = EverydayScene(lambda side: box_scene(smoke().values, side, albedo=0.8), 6, 1.0, None, DENSITY_OF_BOX)
 """The scene ``tutorial``."""
+
+OWN_SCENES = {
+    "tutorial": TUTORIAL,
+    "tutorial_sun": replace(TUTORIAL, build=lambda side: box_scene(smoke().values, side, albedo=0.8, **sun_and_sky())),
+}
+"""The scenes of this study, by name."""
 
 WARM = 3
 """Steps before the timing."""
@@ -90,7 +95,7 @@ class StepsSize(Size):
     scenes: tuple[str, ...] = amount(
         ("smoke_sun_map", "smoke_on_floor", "smoke_point_inside", "god_rays", "tissue", "jade_null_sun"),
         ("smoke_on_floor", "jade_null_sun"),
-        "tutorial, and scenes of the study everyday",
+        "tutorial, tutorial_sun, and scenes of the study everyday",
     )
     sides: tuple[int, ...] = amount((4, 16, 64), (4,), "edges of the image [pixels]")
     spp: tuple[int, ...] = amount((1,), doc="samples per pixel of a step")
@@ -251,9 +256,9 @@ def time_first_step(scene: str, who: str) -> str:
 
 
 def choose_scenes(names: tuple[str, ...]) -> dict[str, EverydayScene]:
-    """The scenes of these names; ``tutorial`` comes last."""
-    scenes = chosen_scenes([name for name in names if name != "tutorial"])
-    return scenes | {"tutorial": TUTORIAL} if "tutorial" in names else scenes
+    """The scenes of these names; those of this study come last."""
+    scenes = chosen_scenes([name for name in names if name not in OWN_SCENES])
+    return scenes | {name: scene for name, scene in OWN_SCENES.items() if name in names}
 
 
 def measure_steps(differentiates: bool, size: StepsSize) -> dict:
