@@ -46,8 +46,9 @@ from mivol.transport.traversal.random_numbers import SpreadSampler
 __all__ = ["carry_tangents", "count_branches", "prepare_derivatives", "replay_branches"]
 
 
-MAX_BRANCHES = 8
-"""Largest number of branches of a path."""
+MAX_BRANCHES = 3
+"""Largest number of branches of a path. More lower variance x time by at most a quarter, in steps that take up to half as long
+again (docs/notes/gradients.md)."""
 
 BALANCE = 26.0
 """(B a) / (A b) times the share of stems with a collision, over the noise of the light at collisions (``Baseline.noise``): B

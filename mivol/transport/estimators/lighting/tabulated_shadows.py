@@ -47,8 +47,8 @@ INSET = 1e-5
 SUN_RADIUS = 0.06
 """Angle around the direction of the sun in which its table is used [rad]."""
 
-SUN_DRAWS = 512
-"""Number of directions among which the sun of an environment is found."""
+SUN_DRAWS, SUN_CANDIDATES = 512, 64
+"""Number of directions whose neighbours are counted to find the sun of an environment, and how many of them may be the sun."""
 
 MIN_TABLE, UNKNOWN = 0.02, 0.3
 """Least transmittance T_0 that a table may claim, and the transmittance that stands for light from other directions than the
@@ -91,13 +91,13 @@ def find_sun(emitter: mi.Emitter) -> tuple[mi.Vector3f, mi.Float]:
     u = mi.Point2f(k / SUN_DRAWS, k * 0.6180339887 - dr.floor(k * 0.6180339887))
     d = emitter.sample_direction(it, u, True)[0].d
     dr.eval(d)
-    pair = dr.arange(mi.UInt32, SUN_DRAWS * SUN_DRAWS)
-    one, other = (dr.gather(mi.Vector3f, d, index) for index in (pair // SUN_DRAWS, pair % SUN_DRAWS))
+    pair, each = dr.arange(mi.UInt32, SUN_CANDIDATES * SUN_DRAWS), SUN_DRAWS // SUN_CANDIDATES
+    one, other = (dr.gather(mi.Vector3f, d, index) for index in (pair // SUN_DRAWS * each, pair % SUN_DRAWS))
     near = dr.select(dr.dot(one, other) > dr.cos(mi.Float(SUN_RADIUS)), mi.UInt32(1), 0)
     counts = dr.block_sum(near, SUN_DRAWS)
     best = dr.max(counts)
-    first = dr.min(dr.select(counts == best, dr.arange(mi.UInt32, SUN_DRAWS), SUN_DRAWS))
-    return dr.gather(mi.Vector3f, d, first), mi.Float(best) / SUN_DRAWS
+    first = dr.min(dr.select(counts == best, dr.arange(mi.UInt32, SUN_CANDIDATES), SUN_CANDIDATES))
+    return dr.gather(mi.Vector3f, d, first * each), mi.Float(best) / SUN_DRAWS
 
 
 # -- The table ----------------------------------------------------------------------------------------------------------
