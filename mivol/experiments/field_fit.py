@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,14 +62,9 @@ class FieldFit(PhotoFit):
     def make_plan(self, settings: FieldExperiment) -> RadiancePlan:
         return make_plan(settings)
 
-    def describe_run(self) -> dict[str, Any]:
-        preset = self.settings.field.preset
-        return {
-            "method": f"a sparse grid of density and spherical harmonics, fitted to photographs; preset {preset}",
-            "seeds": {"fit": self.settings.seed},
-            "units": {"loss": "1"},
-            "citations": ["mitsuba3", "drjit", "plenoxels_2022", "relu_fields_2022", "max_1995"],
-        }
+    def describe_method(self) -> tuple[str, list[str]]:
+        method = "a sparse grid of density and spherical harmonics, fitted to photographs; preset "
+        return method + self.settings.field.preset, ["plenoxels_2022", "relu_fields_2022", "max_1995"]
 
     def load(self, say: Say) -> None:
         super().load(say)

@@ -13,7 +13,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,14 +61,10 @@ class GaussianFit(PhotoFit):
     def make_plan(self, settings: GaussianExperiment) -> GaussianPlan:
         return make_gaussian_plan(settings)
 
-    def describe_run(self) -> dict[str, Any]:
+    def describe_method(self) -> tuple[str, list[str]]:
+        method = f"3D Gaussians, splatted in tiles and fitted to photographs; preset {self.settings.gaussians.preset}"
         relocates = self.plan.control == "relocation"
-        return {
-            "method": f"3D Gaussians, splatted in tiles and fitted to photographs; preset {self.settings.gaussians.preset}",
-            "seeds": {"fit": self.settings.seed},
-            "units": {"loss": "1"},
-            "citations": ["mitsuba3", "drjit", "kerbl_2023", "zwicker_2001", "wang_2004"] + ["kheradmand_2024"] * relocates,
-        }
+        return method, ["kerbl_2023", "zwicker_2001", "wang_2004"] + ["kheradmand_2024"] * relocates
 
     def plan_fit(self) -> list[PlanLine]:
         self.begun = start_gaussians(self.settings, self.photos, self.plan)

@@ -78,17 +78,13 @@ class OctreeFit(FieldFit):
     def make_plan(self, settings: OctreeExperiment) -> OctreePlan:
         return make_octree_plan(settings)
 
-    def describe_run(self) -> dict[str, Any]:
+    def describe_method(self) -> tuple[str, list[str]]:
         preset = find_preset(self.settings.field)
         start = self.settings.field.start or f"a grid, preset {preset}"
         if start in NETWORKS:
             start = f"a {make_network_plan(self.settings).model.noun}, preset {preset}"
-        return {
-            "method": f"an octree of harmonics from {start}, its leaves fitted to photographs",
-            "seeds": {"fit": self.settings.seed},
-            "units": {"loss": "1"},
-            "citations": ["mitsuba3", "drjit", "plenoctrees_2021", "plenoxels_2022", "max_1995"],
-        }
+        method = f"an octree of harmonics from {start}, its leaves fitted to photographs"
+        return method, ["plenoctrees_2021", "plenoxels_2022", "max_1995"]
 
     def plan_fit(self) -> list[PlanLine]:
         self.plan, grid, self.batches = adapt_octree_plan(self.plan, find_preset(self.settings.field), self.photos)

@@ -252,6 +252,19 @@ class PhotoFit(FitKind):
             MivolError: an unknown preset.
         """
 
+    def describe_run(self) -> dict[str, Any]:
+        method, sources = self.describe_method()
+        return {
+            "method": method,
+            "seeds": {"fit": self.settings.seed},
+            "units": {"loss": "1"},
+            "citations": ["mitsuba3", "drjit", *sources],
+        }
+
+    @abstractmethod
+    def describe_method(self) -> tuple[str, list[str]]:
+        """Return the method in a line, and its sources as keys of :data:`mivol.cite.CITATIONS`."""
+
     @abstractmethod
     def plan_fit(self) -> list[PlanLine]:
         """Adapt the plan to the photographs; return the choices with reasons."""

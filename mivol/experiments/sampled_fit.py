@@ -41,14 +41,10 @@ class SampledFit(FieldFit):
     def make_plan(self, settings: HashExperiment | NerfExperiment) -> SampledPlan:
         return make_sampled_plan(settings)
 
-    def describe_run(self) -> dict[str, Any]:
+    def describe_method(self) -> tuple[str, list[str]]:
         kind = self.settings.field.kind
-        return {
-            "method": f"{METHODS[kind]}, fitted to photographs; preset {self.settings.field.preset}",
-            "seeds": {"fit": self.settings.seed},
-            "units": {"loss": "1"},
-            "citations": ["mitsuba3", "drjit", *CITATIONS[kind], "kingma_2015", "max_1995"],
-        }
+        method = f"{METHODS[kind]}, fitted to photographs; preset {self.settings.field.preset}"
+        return method, [*CITATIONS[kind], "kingma_2015", "max_1995"]
 
     def plan_fit(self) -> list[PlanLine]:
         self.batches = make_sampled_batches(self.photos)
