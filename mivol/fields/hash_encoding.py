@@ -183,14 +183,14 @@ class HashEncoding:
             features += sums
         return features
 
-    def add_features(self, unit: mi.Point3f, slopes: list[mi.Float], target: mi.Float, active: mi.Bool = True) -> None:
+    def add_features(self, unit: mi.Point3f, slopes: list[mi.Float], target: mi.Float) -> None:
         """Add derivatives by the features of points to the derivatives by the table: the transpose of :meth:`encode`."""
         width = self.sizes.features
         for number, level in enumerate(self.levels):
             own = slopes[number * width : (number + 1) * width]
             for row, weight in _corners(level, unit):
                 values = own[0] * weight if width == 1 else mi.ArrayXf([slope * weight for slope in own])
-                dr.scatter_add(target, values, row, active, mode=_reduce_mode())
+                dr.scatter_add(target, values, row, mode=_reduce_mode())
 
 
 def _corners(level: Level, unit: mi.Point3f) -> Iterator[tuple[mi.UInt32, mi.Float]]:

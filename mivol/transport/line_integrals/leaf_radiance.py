@@ -203,9 +203,8 @@ class LeafRays:
 
 
 def render_leaves(
-    index: LeafIndex, source: LeafSource, rays: RayBundle, depth: float = MAX_DEPTH, distances: bool = False,
-    active: mi.Bool = True,
-) -> LeafRays:  # fmt: skip
+    index: LeafIndex, source: LeafSource, rays: RayBundle, depth: float = MAX_DEPTH, distances: bool = False
+) -> LeafRays:
     """Follow rays through an octree.
 
     Args:
@@ -214,7 +213,6 @@ def render_leaves(
         rays: world rays.
         depth: optical depth at which a ray ends; the rest is at most e^-depth of the brightest colour.
         distances: compute the expected depth.
-        active: lanes to follow; the others are black.
 
     Error: none but rounding, beside the end at ``depth``. Cost: one packet a leaf with ``LeafColours``.
     """
@@ -234,7 +232,7 @@ def render_leaves(
         return [*light, behind, tau + own, dr.select(on & (first < 0), leaf.t, first)]
 
     state = [*(mi.Float(0) for _ in range(4 if distances else 3)), mi.Float(1), mi.Float(0), mi.Float(-1)]
-    state, cell, last = walk_leaves(index, segment, visit, state, active, lambda s: s[-2] > depth)
+    state, cell, last = walk_leaves(index, segment, visit, state, True, lambda s: s[-2] > depth)
     *light, T, tau, first = state
     distance = dr.fma(1 - T, segment.t0, light[3]) if distances else mi.Float(0)
     return LeafRays(mi.Color3f(*light[:3]), T, distance, tau, fast_max(first, 0), last, cell, rays)
@@ -263,14 +261,13 @@ def raise_leaf_weights(index: LeafIndex, source: LeafSource, rays: RayBundle, we
     walk_leaves(index, segment, visit, [mi.Float(0)], active, lambda state: state[0] > MAX_DEPTH)
 
 
-def vjp_leaves(index: LeafIndex, source: LeafSource, rendered: LeafRays, by: RayGradient, active: mi.Bool = True) -> None:
+def vjp_leaves(index: LeafIndex, source: LeafSource, rendered: LeafRays, by: RayGradient) -> None:
     """Add the derivatives of a scalar to the derivatives of the source.
 
     Args:
         index, source: arguments of :func:`render_leaves`.
         rendered: its result.
         by: derivatives of the scalar by ``colour`` and ``T``; a derivative by ``distance`` is not supported.
-        active: lanes to follow.
 
     Bias: none. Light from behind the end of a ray is left out. Cost: as :func:`render_leaves`, and a packet written a leaf.
     """
@@ -292,4 +289,4 @@ def vjp_leaves(index: LeafIndex, source: LeafSource, rendered: LeafRays, by: Ray
         source.add(leaf.row, front * T * (s - r) * leaf.dt, [weight * c for c in by_colour], on)
         return [dr.select(on, alpha * s + T * r, r), before]
 
-    walk_leaves(index, back, visit, [mi.Float(by.T), mi.Float(rendered.tau)], active & (rendered.last > 0))
+    walk_leaves(index, back, visit, [mi.Float(by.T), mi.Float(rendered.tau)], rendered.last > 0)

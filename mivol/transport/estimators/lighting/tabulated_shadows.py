@@ -205,7 +205,7 @@ class TransmittanceGrid:
 
 
 def measure_transmittance_bias(
-    media: SceneMedia, emitters: SceneEmitters, grid: TransmittanceGrid, lattice: Lattice, points: int = 1 << 14
+    media: SceneMedia, emitters: SceneEmitters, grid: TransmittanceGrid, lattice: Lattice
 ) -> tuple[float, float]:
     """Compare a transmittance grid with exact shadow rays at points of the box of a medium's grid.
 
@@ -213,6 +213,7 @@ def measure_transmittance_bias(
         Mean and root mean square of T_grid - T_exact over points and emitters [1]; the extinction weights the points.
     """
     (body,) = media.bodies
+    points = 1 << 14
     k = mi.Float64(dr.arange(mi.UInt32, points)) + 0.5
     u = [k / points, k * 0.7548776662 - dr.floor(k * 0.7548776662), k * 0.5698402910 - dr.floor(k * 0.5698402910)]
     p = lattice.to_world_points(mi.Vector3f(*(mi.Float(v) for v in u)))
