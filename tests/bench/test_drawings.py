@@ -130,7 +130,7 @@ CLUSTER = {
     "reference": {"ratio": 0.61, "workers": 1.1, "uneven": 1.02, "owner": 0.03},
     "gradient": {"ratio": 0.64},
     "messages": {"seconds": {"8e4": {"median": 0.0031, "fastest": 0.0027}}, "latency": 0.0012, "bandwidth": 2.5e8},
-    "scaling": [{"name": "a fit", "seconds": [4.0, 2.125], "limit": "2 workers: no more units"}],
+    "scaling": [{"name": "a fit", "seconds": [4.0, 2.125], "limit": "2 workers: no more pieces of work"}],
 }
 AXES = {
     "scans": {"head": {"column": 59.8, "error": -0.0312, "sigma": 0.0204, "method": "mirror"}},
@@ -156,7 +156,7 @@ TABLES_OF = [
         "",
         "| workload | 1 | 2 | 4 | 8 | 16 | 32 | 100 | 1000 | fastest |",
         "|---|---|---|---|---|---|---|---|---|---|",
-        "| a fit | 4 | 2.12 | 2 workers: no more units |",
+        "| a fit | 4 | 2.12 | 2 workers: no more pieces of work |",
     ]),
     (conversions, "matrix", {"sources": {"grid": {"psnr": 34.1, "targets": TARGETS}}}, [
         "| from, to | grid | octree | hash grid | NeRF | Gaussians |",

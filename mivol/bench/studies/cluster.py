@@ -123,7 +123,7 @@ def say_limit(work: Workload, network: Network) -> str:
     if work.streams and work.units * message >= math.ceil(work.units / best) * work.unit_seconds:
         return f"{best} workers: the owner receives images one after another"
     if best == work.units:
-        return f"{best} workers: no more units"
+        return f"{best} workers: no more pieces of work"
     if math.ceil(work.units / best) == 1:
         return f"{best} workers: a unit is not divided"
     share = "bytes" if work.message_bytes / network.bandwidth > network.latency else "latency"
