@@ -134,7 +134,7 @@ Keyframe = tuple[float, float, float, float, float, float]
 class ShowSettings(Section):
     """Images, film and curve of a fit of photographs."""
 
-    views: Annotated[int, setting("view", "judged views that the report shows in full", ge=0)] = 4
+    views: Annotated[int, setting("view", "held-out views that the report shows in full", ge=0)] = 4
     frames: Annotated[int, setting("frame", "frames of the film; 0: no film", ge=0, le=65536)] = 60
     way: Annotated[
         Literal["turntable", "views", "keyframes"],
@@ -145,7 +145,7 @@ class ShowSettings(Section):
     ] = ()
     every: Annotated[int, setting("step", "steps between two points of the held-out curve", ge=1)] = 250
     judged: Annotated[int, setting("view", "held-out views in the curve, the same at each point; 0: all", ge=0)] = 4
-    metrics: Annotated[tuple[str, ...], setting("1", "metrics of the judged views: psnr, ssim, flip", min_length=1)] = (
+    metrics: Annotated[tuple[str, ...], setting("1", "metrics of the held-out views: psnr, ssim, flip", min_length=1)] = (
         "psnr",
         "ssim",
     )

@@ -177,7 +177,7 @@ def write_geometry(folder: Path, view: FieldView, camera: Camera, near_far: tupl
     written = []
     for name, (pixels, scale) in pictures.items():
         write_png(folder / f"views/{name}.png", decode_srgb(pixels / 255))
-        caption = f"{name} of the first judged view: {scale}"
+        caption = f"{name} of the first held-out view: {scale}"
         written.append(Image(path=f"views/{name}.png", role="picture", caption=caption))
     return written
 

@@ -261,7 +261,7 @@ def _bar_labels(scales: dict[str, pixel_scale.Scale], image: Image | None) -> li
     labels = {
         "reference": f"{quantity[:1].upper()}{quantity[1:]}",
         "difference": names["difference"],
-        "error": "|Render − reference|, mean over RGB [code value]",
+        "error": "|Render − reference|, mean over RGB [sRGB value]",
         "z": names["z"] if names is PANELS_OF_LINES else "z = difference / standard error",
     }
     return [(role, label) for role, label in labels.items() if role in scales]

@@ -124,7 +124,7 @@ def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path
     assert "PSNR compares 8-bit sRGB values; its peak is 1." in page
     assert "largest value as its peak" not in page
     assert f"{record['results']['held_out_psnr']:.1f} dB PSNR on held-out views" in page
-    shown = ("data:video/mp4;base64,", "distance of the first judged view", "Cameras, and the box of the matter", "Storage")
+    shown = ("data:video/mp4;base64,", "distance of the first held-out view", "Cameras, and the box of the matter", "Storage")
     for text in (*shown, "view_3.png"):
         assert text in page
     rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]

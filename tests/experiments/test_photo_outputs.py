@@ -93,8 +93,8 @@ def test_distance_and_normals_are_pictures(tmp_path):
     found = field_fit.write_geometry(tmp_path, seen, camera(), (1.0, 2.0))
     assert [(i.path, i.role) for i in found] == [("views/distance.png", "picture"), ("views/normals.png", "picture")]
     assert [i.caption for i in found] == [
-        "distance of the first judged view: from light, 1 [length], to dark, 2 [length]",
-        "normals of the first judged view: x, y, z from -1 to 1 as red, green, blue",
+        "distance of the first held-out view: from light, 1 [length], to dark, 2 [length]",
+        "normals of the first held-out view: x, y, z from -1 to 1 as red, green, blue",
     ]
     for image in found:
         assert np.array(Image.open(tmp_path / image.path)).shape == (2, 4, 3)

@@ -101,7 +101,7 @@ def test_8_bit_views_show_their_absolute_error(tmp_path: Path) -> None:
     gallery = make_view_rows(tmp_path, images)
     assert [view.small for view in gallery.rows] == [False, True]
     (bar,) = gallery.bars
-    assert bar.label == "|Render − reference|, mean over RGB [code value]"
+    assert bar.label == "|Render − reference|, mean over RGB [sRGB value]"
     for view in gallery.rows:
         assert [picture.name for picture in view.pictures] == ["Reference", "Render", "|Render − reference|"]
         error = pixels(view.pictures[2])
