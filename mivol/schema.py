@@ -162,8 +162,8 @@ def settings_in(kind: type) -> list[Setting]:
     hints = get_type_hints(kind, include_extras=True)
     for field in msgspec.structs.fields(kind):
         hint, key = hints[field.name], field.name
-        described = next((part for part in (hint, *get_args(hint)) if hasattr(part, "__metadata__")), None)
-        meta = described.__metadata__[0] if described else setting("1", "one of " + ", ".join(map(str, get_args(hint))))
+        described = next(part for part in (hint, *get_args(hint)) if hasattr(part, "__metadata__"))
+        meta = described.__metadata__[0]
         inner = getattr(hint, "__origin__", hint) if described is hint else hint
         many = get_origin(inner) is tuple and bool(structs_in(get_args(inner)[0]))
         structs = structs_in(get_args(inner)[0] if many else inner)

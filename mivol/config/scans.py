@@ -345,7 +345,7 @@ class ScanExperiment(Section):
     ] = None
     solve: Annotated[SolveSettings, setting("1", "the inversion")] = SolveSettings()
     slabs: Annotated[Slabs | None, setting("1", "slabs of a volume beyond memory; absent: the whole volume at once")] = None
-    held_out_every: Annotated[int, setting("view", "step between views that are not fitted; 0: none", ge=0)] = 0
+    held_out_every: Annotated[int, setting("view", "every n-th view is not fitted; 0: all are fitted", ge=0)] = 0
     checkpoint_every: Annotated[int, setting("iteration", "iterations between two checkpoints", ge=1)] = 5
     unit: Annotated[str, setting("1", "unit of all lengths, such as mm, kept with the volume; empty: unknown")] = ""
     keep_state: Annotated[

@@ -151,7 +151,8 @@ def _setting(unit: str, meaning: str, **domain: float) -> msgspec.Meta:
     return msgspec.Meta(description=meaning, extra={"unit": unit}, **domain)
 
 
-Pixels = Annotated[int, _setting("pixel", "image size along one side", ge=1, le=65536)]
+Pixels = Annotated[int, _setting("pixel", "edge of the image", ge=1, le=65536)]
+UpAxis = Annotated[Literal["x", "y", "z"], _setting("1", "axis of the world that points up")]
 Count = Annotated[int, _setting("1", "number of views", ge=1, le=65536)]
 Degrees = Annotated[float, _setting("degree", "angle of the first camera around the object")]
 
@@ -233,7 +234,7 @@ class Ring(PlacedRig, frozen=True, tag="ring"):
     elevation: Annotated[float, _setting("degree", "height above the horizon", ge=-90, le=90)] = 0.0
     start: Degrees = 0.0
     arc: Annotated[float, _setting("degree", "angle that the cameras span around the object", gt=0, le=360)] = 360.0
-    up: Literal["x", "y", "z"] = "y"
+    up: UpAxis = "y"
 
     def poses(self, center: np.ndarray, radius: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Equal steps of azimuth at the same elevation."""
@@ -254,7 +255,7 @@ class Hemisphere(PlacedRig, frozen=True, tag="hemisphere"):
     distance: Annotated[float, _setting("radius of the box", "camera to middle", gt=1)] = 4.0
     lowest: Annotated[float, _setting("degree", "lowest elevation; -90 is the whole sphere", ge=-90, lt=90)] = 0.0
     start: Degrees = 0.0
-    up: Literal["x", "y", "z"] = "y"
+    up: UpAxis = "y"
 
     def poses(self, center: np.ndarray, radius: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Equal steps of height, golden steps of azimuth."""
