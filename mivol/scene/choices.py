@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from mivol.files.volume import VOXELS
 from mivol.scene.needs import MediumFacts, Needs
+from mivol.scene.survey import OwnRaysNoise
 from mivol.transport.media.body import flight_parts
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.path.estimators import Settings
@@ -25,11 +26,13 @@ __all__ = [
     "choose_lamp_rays",
     "choose_lighting",
     "choose_media_light",
+    "choose_mirror_rays",
     "choose_near_light",
     "describe_orders",
     "is_branch_noise_open",
     "is_emission_noise_open",
     "is_lamp_noise_open",
+    "is_mirror_noise_open",
     "is_near_light_open",
     "choose_shadow_table",
     "choose_shadows",
@@ -70,9 +73,10 @@ LAMP_RAYS, LAMP_COST, MIN_LAMP_GAIN, MIN_LAMP_SAMPLES = (4, 8, 16), 0.05, 1.2, 1
 """Own camera rays a sample for lamps in view, the time of one over the time of a path (measured: 0.03 in a room of depth 10,
 0.07 to 0.14 beside glass), the smallest predicted gain, and the samples of an image below which nothing is measured."""
 
-EMISSION_RAYS, EMISSION_COST, MIN_EMISSION_GAIN = (0.0625, 0.125, 0.25, 0.5, 1.0), 1.0, 1.2
-"""Own camera rays a sample for the light of media that does not scatter, the time of one over the time of a path (measured: an
-explosion of 160 x 160 x 240 nodes, depth 8, 0.9), and the smallest predicted gain."""
+OWN_RAYS, EMISSION_COST, MIRROR_COST, MIN_OWN_GAIN = (0.0625, 0.125, 0.25, 0.5, 1.0), 1.0, 0.5, 1.2
+"""Own camera rays a sample for the light of media that does not scatter, or the light that glass mirrors; the time of one over
+the time of a path (measured: 0.9 in an explosion of 160 x 160 x 240 nodes, depth 8; mirrors 0.3 to 0.5 in balls of glass), and
+the smallest predicted gain."""
 
 MIN_BRANCHING_SAMPLES, MAX_IMAGE_BRANCHES, MAX_BRANCHING_TIME, MIN_BRANCHING_GAIN = 1 << 16, 4, 2.0, 1.1
 """Samples of an image below which no preview measures branches, most branches of a path, most time of an image over the time
@@ -498,17 +502,47 @@ def choose_emission_rays(needs: Needs, settings: Settings, segment: str) -> tupl
     """
     if not is_emission_noise_open(needs, settings, segment) or needs.emission_noise is None:
         return 0, []
-    noise = needs.emission_noise
-    counts = {max(1, round(share * needs.spp)) for share in EMISSION_RAYS}
-    work = {k: (noise.rays * k**-1.5 + noise.rest / needs.spp) * (1 + EMISSION_COST * k / needs.spp) for k in sorted(counts)}
+    count, why = _count_own_rays(needs.emission_noise, needs.spp, EMISSION_COST)
+    if count == 0:
+        return 0, [Choice("emission in view", "found by paths", why)]
+    return count, [Choice("emission in view", f"summed along {count} camera rays of its own a pixel, in images", why)]
+
+
+def is_mirror_noise_open(needs: Needs, settings: Settings, segment: str) -> bool:
+    """Whether a preview decides if the light that glass mirrors to the camera gets camera rays of its own."""
+    if segment != "free_flight" or settings.scatterings < 1 or not needs.has_glass:
+        return False
+    return needs.are_samples_independent and needs.is_colour_film and needs.film_samples >= MIN_LAMP_SAMPLES
+
+
+def choose_mirror_rays(needs: Needs, settings: Settings, segment: str) -> tuple[int, list[Choice]]:
+    """Choose the number of own camera rays of a pixel for the light that the first glass mirrors, in images; 0 for none.
+
+    Glass mirrors some 4 to 8 % of the light, so that by chance few samples see what a mirror shows.
+    """
+    if not is_mirror_noise_open(needs, settings, segment) or needs.mirror_noise is None:
+        return 0, []
+    count, why = _count_own_rays(needs.mirror_noise, needs.spp, MIRROR_COST)
+    if count == 0:
+        return 0, [Choice("light mirrored by glass", "found by chance", why)]
+    return count, [Choice("light mirrored by glass", f"found along {count} camera rays of its own a pixel, in images", why)]
+
+
+def _count_own_rays(noise: OwnRaysNoise, spp: int, cost: float) -> tuple[int, str]:
+    """The number of own camera rays of a pixel with the least variance x time, 0 for none, and the reason.
+
+    Args:
+        noise: measured variances.
+        spp: samples per pixel.
+        cost: time of an own ray over the time of a path [1].
+    """
+    counts = {max(1, round(share * spp)) for share in OWN_RAYS}
+    work = {k: (noise.rays * k**-1.5 + noise.rest / spp) * (1 + cost * k / spp) for k in sorted(counts)}
     best = min(work, key=work.get)
-    gain = noise.paths / needs.spp / work[best] if work[best] > 0 else 0.0
+    gain = noise.paths / spp / work[best] if work[best] > 0 else 0.0
     ratio = noise.paths / noise.rest if noise.rest > 0 else math.inf
     share = f"with it, paths have {ratio:.2g} times the noise of all other light in a preview"
-    if gain < MIN_EMISSION_GAIN:
-        return 0, [Choice("emission in view", "found by paths", share)]
-    why = f"{share}: the same error {gain:.2g} times as fast"
-    return best, [Choice("emission in view", f"summed along {best} camera rays of its own a pixel, in images", why)]
+    return (0, share) if gain < MIN_OWN_GAIN else (best, f"{share}: the same error {gain:.2g} times as fast")
 
 
 def _explain_missing_lamp_rays(needs: Needs, settings: Settings) -> str | None:

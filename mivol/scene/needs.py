@@ -35,7 +35,7 @@ from mivol.scene.survey import (
     OUTSIDE_SHAPES,
     Boundary,
     BranchNoise,
-    EmissionNoise,
+    OwnRaysNoise,
     SceneSurvey,
     ShapeFacts,
     find_outside_media,
@@ -363,9 +363,10 @@ class Needs(ShapeFacts):
             before a measurement.
         lamp_noise: measured variances, for one sample of a pixel, of the light of lamps seen directly and of all other light;
             None before a measurement.
-        emission_noise: what a preview measures of the light of media seen directly (:class:`EmissionNoise`); None before a
+        emission_noise: what a preview measures of the light of media seen directly (:class:`OwnRaysNoise`); None before a
             measurement.
         branch_noise: what a preview measures of paths that branch (:class:`BranchNoise`); None before a measurement.
+        mirror_noise: what a preview measures of the light that glass mirrors to the camera; None before a measurement.
         media_light: the light that media emit; None without such light, without scattering, or if the light could not be read.
     """
 
@@ -385,8 +386,9 @@ class Needs(ShapeFacts):
     emitter_distances: tuple[float, ...]
     near_gain: float | None = None
     lamp_noise: tuple[float, float] | None = None
-    emission_noise: EmissionNoise | None = None
+    emission_noise: OwnRaysNoise | None = None
     branch_noise: BranchNoise | None = None
+    mirror_noise: OwnRaysNoise | None = None
     media_light: MediaLight | None = None
 
     @property
@@ -407,7 +409,7 @@ class Needs(ShapeFacts):
         may_scatter = any("sigma_t" not in key.split(".") for key, _ in differentiated)
         if any(m.emits or (may_scatter and not m.is_scattering) for m in self.media):
             return None
-        return replace(self, lamp_noise=None, branch_noise=None, **_sort_parameters(differentiated))
+        return replace(self, lamp_noise=None, branch_noise=None, mirror_noise=None, **_sort_parameters(differentiated))
 
     def with_views(self, survey: SceneSurvey, asymmetries: list[mi.Float | None]) -> Needs:
         """The same facts with the media viewed anew: a recording reads their arrays from the scene, all but ``asymmetries``."""

@@ -30,6 +30,7 @@ from mivol.scene.choices import (
     choose_lamp_rays,
     choose_lighting,
     choose_media_light,
+    choose_mirror_rays,
     choose_near_light,
     choose_scattering_points,
     choose_shadow_table,
@@ -123,6 +124,7 @@ class Plan:
         have_low_albedo: whether some albedo of each medium may be too low for derivatives to be found at collisions.
         shadow_nodes: nodes along an edge of the table of shadows, in images; 0 for shadow rays.
         emission_rays: own camera rays of a pixel for the light of media that does not scatter, in images; 0 for none.
+        mirror_rays: own camera rays of a pixel for the light that glass mirrors to the camera, in images; 0 for none.
         lamp_rays: own camera rays a sample for the light of lamps seen directly, in images; 0 for none.
         occupied: share of occupied blocks of the first medium's grid, in steps of ``OCCUPIED_STEP`` [1]; None if unknown.
     """
@@ -149,6 +151,7 @@ class Plan:
     lamp_rays: int
     shadow_nodes: int
     emission_rays: int
+    mirror_rays: int
 
     @property
     def decisions(self) -> tuple:
@@ -160,6 +163,8 @@ class Plan:
         """The estimators of the light without camera rays of its own."""
         if self.lamp_rays:
             estimators = replace(estimators, shows="rest")
+        if self.mirror_rays:
+            estimators = replace(estimators, glass="transmits")
         return replace(estimators, camera_emission=0.0) if self.emission_rays else estimators
 
     def readings(self, for_images: bool) -> tuple:
@@ -268,6 +273,8 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     choices += why
     emission_rays, why = choose_emission_rays(needs, settings, segment)
     choices += why
+    mirror_rays, why = choose_mirror_rays(needs, settings, segment)
+    choices += why
     nodes, why = choose_shadow_table(needs, settings, segment)
     choices += why
     return Plan(
@@ -293,6 +300,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         lamp_rays,
         nodes,
         emission_rays,
+        mirror_rays,
     )
 
 

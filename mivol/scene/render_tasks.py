@@ -192,6 +192,7 @@ class ImageTask(RenderTask):
         spp = self.spp or sensor.sampler().sample_count()
         own = [(spp * plan.lamp_rays, estimators.of_lamps)] if plan.lamp_rays else []
         own += [(plan.emission_rays, estimators.of_camera_emission)] if plan.emission_rays else []
+        own += [(plan.mirror_rays, estimators.of_mirrors)] if plan.mirror_rays else []
         lights = [LightOfOwnRays(count, partial(_find_radiance, find())) for count, find in own]
         estimators = plan.light_of_paths(estimators)
         return render_on_film(samples, self.aovs, lambda rays: _render_primal(estimators, rays, plan, self.aovs), lights)

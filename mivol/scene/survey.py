@@ -17,6 +17,7 @@ from mivol.transport.estimators.lighting.emitters import UNIFORM_EMITTER
 from mivol.transport.media.body import Body
 from mivol.transport.media.medium_view import MediumView, nested_field, view_medium
 from mivol.transport.media.stock_grids import StockGrids
+from mivol.transport.path.event import GLASS
 from mivol.transport.traversal.box import Box, fit_ball, fit_box
 
 MAX_FOLLOWED_SURFACES = 16
@@ -53,13 +54,13 @@ class BranchNoise:
 
 
 @dataclass(frozen=True)
-class EmissionNoise:
-    """What a preview measures of the light that media emit towards the camera: variances in a pixel, for one sample.
+class OwnRaysNoise:
+    """What a preview measures of light that may have camera rays of its own: variances in a pixel, for one sample.
 
     Attributes:
         paths: of all light, by paths alone.
         rest: of the light of paths without this light.
-        rays: of this light, summed along camera rays.
+        rays: of this light, along rays of its own.
     """
 
     paths: float
@@ -82,6 +83,7 @@ class ShapeFacts:
         is_sealed: whether every medium lies behind refracting boundaries without undeviated light, with all emitters outside
             and hittable by paths. Emitter sampling then finds no light from inside a medium.
         stops_rays: whether every traced boundary of a medium stops or turns all rays, so that a segment stays in one medium.
+        has_glass: whether a surface is smooth glass, and every surface that only mirrors and transmits is.
         surface_boxes: (3, 4) maps from the world to cubes [-1, 1]^3 around the ``surfaces``; None for many surfaces, or with a
             traced boundary of a medium.
     """
@@ -94,6 +96,7 @@ class ShapeFacts:
     refractive: tuple[str, ...] = ()
     is_sealed: bool = False
     stops_rays: bool = False
+    has_glass: bool = False
     surface_boxes: tuple[np.ndarray, ...] | None = None
 
 
@@ -124,6 +127,7 @@ class SceneSurvey:
         lamp_noise: measured variances of the light of lamps seen directly, and of all other light, by sensor.
         emission_noise: what previews have measured of the light of media seen directly, by sensor.
         branch_noise: what previews have measured of branching paths, by sensor.
+        mirror_noise: what previews have measured of the light that glass mirrors to the camera, by sensor.
     """
 
     boundaries: tuple[Boundary, ...]
@@ -145,8 +149,9 @@ class SceneSurvey:
     gain_of_draws: float | None = None
     near_gain: float | None = None
     lamp_noise: dict[int, tuple[float, float]] = field(default_factory=dict)
-    emission_noise: dict[int, EmissionNoise] = field(default_factory=dict)
+    emission_noise: dict[int, OwnRaysNoise] = field(default_factory=dict)
     branch_noise: dict[int, BranchNoise] = field(default_factory=dict)
+    mirror_noise: dict[int, OwnRaysNoise] = field(default_factory=dict)
 
     @property
     def usable_tracer(self) -> mi.Scene | None:
@@ -213,6 +218,7 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
         are_emitters_far=_are_emitters_far(scene.emitters()),
         refractive=tuple(refractive),
         is_sealed=_are_sealed(boundaries, shapes, scene.emitters()),
+        has_glass=_has_glass(surfaces),
         stops_rays=not has_null and not any(_is_bare(edge) for edge in edges),
         surface_boxes=pieces if 0 < len(pieces) <= MAX_SURFACE_BOXES else None,
     )
@@ -226,6 +232,15 @@ def _read_placement(shape: mi.Shape) -> object:
     if "vertex_positions" in params:
         return dr.detach(params["vertex_positions"])
     return [*shape.bbox().min, *shape.bbox().max]
+
+
+def _has_glass(surfaces: Sequence[mi.Shape]) -> bool:
+    """Whether smooth glass is among some surfaces, and no other BSDF has its components (a mask on a mirror has)."""
+    if any(is_instance(shape) for shape in surfaces):
+        return False
+    bsdfs = (shape.bsdf() for shape in surfaces)
+    names = {bsdf.class_name() for bsdf in bsdfs if int(bsdf.flags()) & int(mi.BSDFFlags.All) in GLASS}
+    return bool(names) and names <= {"SmoothDielectric", "ThinDielectric"}
 
 
 def _make_tracer(shapes: list[mi.Shape]) -> mi.Scene:

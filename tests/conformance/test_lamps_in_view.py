@@ -1,7 +1,8 @@
-"""What the camera sees directly has camera rays of its own where paths find it with noise: lamps, and the light of media."""
+"""Light has camera rays of its own where paths find it with noise: lamps in view, the light of media, and mirrors of glass."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import drjit as dr
@@ -14,10 +15,10 @@ from scattering_scenes import PLACE, assert_same_images, assert_same_whole, clos
 
 from mivol.experiments.script import explain
 from mivol.scene import choices, plan
-from mivol.scene.survey import EmissionNoise
+from mivol.scene.survey import OwnRaysNoise
 from mivol.threads import set_thread_count
 from mivol.transport.path.estimators import Settings
-from scenes import as_float32, box_of, camera, grid_volume, medium, render, sky
+from scenes import as_float32, ball_of, box_of, camera, grid_volume, medium, render, sky
 
 RADIANCE = 8.0
 
@@ -189,7 +190,7 @@ def test_a_fire_in_view_gets_rays_of_its_own(variant_rgb: str) -> None:
 
 
 def rays_of(paths: float, rest: float, rays: float, spp: int = 64, **more: object) -> int:
-    facts = SimpleNamespace(emission_noise=EmissionNoise(paths, rest, rays), spp=spp)
+    facts = SimpleNamespace(emission_noise=OwnRaysNoise(paths, rest, rays), spp=spp)
     return choices.choose_emission_rays(facts, Settings(max_depth=4), "free_flight")[0]
 
 
@@ -205,3 +206,90 @@ def test_the_rays_of_an_emission_follow_noise_and_cost(monkeypatch: pytest.Monke
     assert rays_of(1.1, 1.0, 0.0) == 0
     assert rays_of(0.0, 0.0, 0.0) == 0
     assert rays_of(100.0, 1.0, 0.0, spp=4) == 1
+
+
+# -- The light that glass mirrors -------------------------------------------------------------------------------------------
+
+
+def aquarium(glass: dict, inside: bool = False, res: int = 12, **film: object) -> mi.Scene:
+    """A ball of fog in glass before a small lamp, in a room with a floor and a dim sky; the camera is outside or inside."""
+    place = mi.ScalarTransform4f().look_at(origin=[1, -3, 3], target=[0, 0, 0], up=[0, 0, 1]).scale(0.4)
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(5)}
+    fog = medium("homogeneous", 0.7, 0.8)
+    tank = ball_of(fog, (0, 0, 0), 1.0) | {"bsdf": glass}
+    # Light is totally reflected at a ball's wall for rays that pass its middle at more than 1 / 1.5 of its radius.
+    origin, target = ([0.1, -0.9, 0], [1, -0.5, 0.1]) if inside else ([0, -4, 0.6], [0, 0, 0])
+    sensor = camera(origin, target, res, fov=80 if inside else 28)
+    sensor["film"] |= film
+    lamp = {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": 3.0}}
+    parts = {"tank": tank, "lamp": lamp, "floor": floor, "sky": sky(0.5)}
+    if inside:
+        parts |= {"fog": fog, "tank": tank | {"interior": {"type": "ref", "id": "fog"}}}
+        parts = {"fog": parts.pop("fog"), **parts}
+        sensor["medium"] = {"type": "ref", "id": "fog"}
+    return mi.load_dict({"type": "scene", **parts, "sensor": sensor})
+
+
+THIN, THICK = {"type": "thindielectric", "int_ior": 3.0}, {"type": "dielectric", "int_ior": 1.5}
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize(
+    ("glass", "inside"),
+    [(THIN, False), pytest.param(THICK, False, marks=pytest.mark.slow), pytest.param(THICK, True, marks=pytest.mark.slow)],
+    ids=["thin", "thick", "total reflection"],
+)
+def test_mirrored_and_transmitted_light_add_up(
+    variant_rgb: str, monkeypatch: pytest.MonkeyPatch, glass: dict, inside: bool
+) -> None:
+    """Four mirror rays for the 32 paths of a pixel, whose first glass transmits, beside `volpath`."""
+    monkeypatch.setattr(plan, "choose_mirror_rays", lambda *_: (4, []))
+    scene, depth = aquarium(glass, inside), {"max_depth": 5}
+    assert_same_images(scene, (32, 128), tile=3, ours=mivol(**depth), stock=volpath(**depth), precision=0.03)
+
+
+@pytest.mark.statistical
+def test_alpha_holds_what_thin_glass_mirrors(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ball without fog before nothing: its alpha is the share that its two walls mirror, with and without mirror rays."""
+    found = []
+    for rays in (0, 4):
+        monkeypatch.setattr(plan, "choose_mirror_rays", lambda *_, rays=rays: (rays, []))
+        ball = ball_of(medium("homogeneous", 1e-4, 0.5), (0, 0, 0), 1.0) | {"bsdf": THIN}
+        sensor = camera([0, -4, 0.6], [0, 0, 0], 8, fov=20)
+        sensor["film"] |= {"pixel_format": "rgba"}
+        scene = mi.load_dict({"type": "scene", "ball": ball, "lamp": lamp(0.5), "sensor": sensor})
+        m = moments(scene, mivol(max_depth=4), 64, first=1000 * rays)
+        found.append(replace(m, mean=m.mean[..., 3:], m2=m.m2[..., 3:]))
+    assert 0.1 < found[1].mean.mean() < 0.9
+    assert_same_whole(*found, precision=0.03)
+
+
+def mirror_lines(scene: mi.Scene, depth: int = 4) -> str:
+    return explain(scene, depth).partition("light mirrored by glass")[2].partition("\n  images")[0]
+
+
+def test_a_bright_lamp_in_a_mirror_gets_rays_of_its_own(variant_rgb: str) -> None:
+    assert "camera rays of its own" in mirror_lines(aquarium(THIN, res=96))
+
+
+def test_nothing_else_counts_as_glass(variant_rgb: str) -> None:
+    """No mirror is seen at depth 1. A mask on a mirror has the components of thin glass, and draws them otherwise."""
+    assert not mirror_lines(aquarium(THIN, res=96), depth=1)
+    assert not mirror_lines(aquarium({"type": "mask", "opacity": 0.3, "bsdf": {"type": "conductor"}}, res=96))
+
+
+def test_the_mirror_rays_follow_noise_and_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """(v k^-3/2 + 1 / 64)(1 + k / 128) for a variance v of a ray and 1 of other light, over k of 4, 8, 16, 32, 64.
+
+    v = .03 has .0200, .0180 and .0181 at 4, 8 and 16; v = .1 has .0213, .0193 and .0202 at 8, 16 and 32; v = 8 has .0748 and
+    .0469 at 32 and 64.
+    """
+    monkeypatch.setattr(choices, "is_mirror_noise_open", lambda *_: True)
+
+    def rays_of(paths: float, rays: float) -> int:
+        facts = SimpleNamespace(mirror_noise=OwnRaysNoise(paths, 1.0, rays), spp=64)
+        return choices.choose_mirror_rays(facts, Settings(max_depth=4), "free_flight")[0]
+
+    for v, expected in ((0.0, 4), (0.03, 8), (0.1, 16), (8.0, 64)):
+        assert rays_of(100.0, v) == expected
+    assert rays_of(1.1, 0.0) == 0

@@ -243,6 +243,8 @@ class Estimators:
         near: estimator of the light of near emitters along segments of paths in media; None if vertices draw this light.
         camera_emission: weight of the light that media emit towards the camera without scattering [1]: 0 if this light has
             camera rays of its own.
+        glass: what the first smooth glass of a camera ray does to it: "any" by chance, "transmits", or "mirrors"; the light of
+            the last two adds up to that of the first.
         shows: emitters that the camera sees directly: "all", the "lamps" (emitters with a surface), or the "rest".
         media: media of the scene.
         draws_shadows: shadow rays of vertices are estimated, by tracking or by roulette, with a random number.
@@ -259,6 +261,7 @@ class Estimators:
     near: NearLighting | None = None
     shows: str = "all"
     camera_emission: mi.Float | float = 1.0
+    glass: str = "any"
     media: SceneMedia = field(init=False)
     draws_shadows: bool = field(init=False)
 
@@ -291,6 +294,11 @@ class Estimators:
         """The estimators of the light that media emit towards the camera, attenuated and without scattering."""
         settings = replace(self.settings, max_depth=1, hide_emitters=True)
         return Estimators(self.direct, Emission(self.media, is_sampled=True), settings, lights_surfaces=False)
+
+    def of_mirrors(self) -> Estimators:
+        """The estimators of the light that the first glass of a camera ray mirrors."""
+        settings = replace(self.settings, hide_emitters=True)
+        return replace(self, settings=settings, camera_emission=0.0 if self.media.emits else 1.0, glass="mirrors")
 
     def replayed(self) -> Estimators:
         """The estimators of the radiance that a replay subtracts from, without light sampled anew for its derivatives."""

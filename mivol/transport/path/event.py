@@ -15,7 +15,7 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.traversal.rays import FineRay, Ray, spawn_ray
 
-__all__ = ["DirectionSamples", "NextDirection", "PathEvent", "sample_next_direction"]
+__all__ = ["GLASS", "DirectionSamples", "NextDirection", "PathEvent", "is_glass", "sample_next_direction"]
 
 
 # -- The end of a segment ------------------------------------------------------------------------------------------------
@@ -79,6 +79,19 @@ TRANSMISSION = int(
 """Flags of BSDFs that transmit light."""
 
 
+ALMOST_ONE = 1 - 2**-24
+"""Largest float32 below 1."""
+
+GLASS = tuple(int(mi.BSDFFlags.DeltaReflection) | int(kind) for kind in (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null))
+"""Flags of the BSDFs that only mirror and transmit."""
+
+
+def is_glass(si: mi.SurfaceInteraction3f) -> mi.Bool:
+    """Whether a surface only mirrors and transmits."""
+    components = si.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.All))
+    return (components == GLASS[0]) | (components == GLASS[1])
+
+
 # -- The direction onwards -----------------------------------------------------------------------------------------------
 
 
@@ -119,11 +132,14 @@ class DirectionSamples:
         component: uniform random number in [0, 1) for the component of the BSDF or phase function.
         direction: two uniform random numbers in [0, 1) for the direction.
         aimed: directions around emitters, drawn for a share of the samples (lobes in media only); None for no such directions.
+        splits: lanes at the first glass of their path, which does what ``Estimators.glass`` says, with its share of the light;
+            None if chance decides everywhere.
     """
 
     component: mi.Float
     direction: mi.Point2f
     aimed: AimedDirections | None = None
+    splits: mi.Bool | None = None
 
 
 PER_LANE = ("ray", "medium", "weight", "pdf", "delta", "eta", "origin", "on", "through")
@@ -158,7 +174,14 @@ def _sample_bsdf(
     """Sample a direction of the BSDF; a null component transmits the ray without deviation."""
     media, si = estimators.media, event.si
     bsdf = si.bsdf()
-    sample, weight = bsdf.sample(mi.BSDFContext(), si, samples.component, samples.direction, event.at_surface)
+    component, mirrors = samples.component, estimators.glass == "mirrors"
+    if samples.splits is not None:
+        # Mitsuba's glass mirrors for numbers up to the reflectance, and then its density is the reflectance.
+        component = dr.select(samples.splits, 0 if mirrors else ALMOST_ONE, component)
+    sample, weight = bsdf.sample(mi.BSDFContext(), si, component, samples.direction, event.at_surface)
+    if samples.splits is not None:
+        is_mirrored = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaReflection)
+        weight = dr.select(samples.splits, dr.select(is_mirrored == mirrors, weight * sample.pdf, 0), weight)
     if samples.aimed is not None and samples.aimed.cosine is None:
         sample, weight = _mix_bsdf(si, sample, weight, samples, event.at_surface)
     through = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)

@@ -39,7 +39,7 @@ from mivol.transport.estimators.single_scattering.near_light import AimedDirecti
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.extinction import to_components
 from mivol.transport.path.estimators import Estimators
-from mivol.transport.path.event import DirectionSamples, PathEvent, sample_next_direction
+from mivol.transport.path.event import DirectionSamples, PathEvent, is_glass, sample_next_direction
 from mivol.transport.path.side_flight import (
     SideFlightSamples,
     WeightedEmitterSample,
@@ -115,6 +115,7 @@ class Path:
         left_medium: lanes in which ``last`` is a point of a medium; None if vertices draw the light of near emitters.
         known: flights of camera rays, for the first segment of the path, and the collisions at which stems have stopped; None
             if all flights are drawn with the segment.
+        met_glass: lanes that have met smooth glass; None if chance decides what glass does (``Estimators.glass``).
     """
 
     ray: FineRay
@@ -137,6 +138,7 @@ class Path:
     emission_pdf: mi.Float | None = None
     left_medium: mi.Bool | None = None
     known: KnownFlight | None = None
+    met_glass: mi.Bool | None = None
 
 
 @dataclass
@@ -236,6 +238,7 @@ def start_path(
         emission_pdf=None if estimators.emission is None else dr.zeros(mi.Float, n),
         left_medium=None if estimators.near is None else dr.full(mi.Bool, False, n),
         tabulated=KeptShadow.empty(n) if estimators.tabulates_shadows else None,
+        met_glass=None if estimators.glass == "any" else dr.full(mi.Bool, False, n),
     )
 
 
@@ -451,6 +454,8 @@ def _walk_from_collision(estimators: Estimators, path: Path, collision: Collisio
 def _follow_segment(estimators: Estimators, path: Path) -> tuple[Path, PathEvent]:
     """Follow the next segment: report the light of its media as a term and their transmittance as a factor."""
     may_scatter = path.active & (path.depth + 1 < estimators.settings.depth_limit)
+    if estimators.glass == "mirrors":
+        may_scatter &= path.depth > 0
     samples = estimators.segment.draw(path.sampler, may_scatter)
     # Copies: throughput and depth change in place below, and derivatives read the values at the start of the segment later.
     segment = PathSegment(path.ray, path.medium, mi.Spectrum(path.beta), may_scatter, samples, mi.UInt32(path.depth))
@@ -508,20 +513,25 @@ def _emitter_pdf(estimators: Estimators, path: Path, direct: mi.DirectionSample3
 def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
     """Estimate the direct light at the end of a segment, and sample the direction in which the path continues."""
     arrives, sampler, limit = event.at_surface | event.in_medium, path.sampler, estimators.settings.depth_limit
-    may_scatter = arrives & (path.depth + 1 < limit)
+    may_scatter, splits = arrives & (path.depth + 1 < limit), None
+    if path.met_glass is not None:
+        splits = event.at_surface & (path.depth == 0) & ~path.met_glass & is_glass(event.si)
+        path.met_glass |= splits
+        if estimators.glass == "mirrors":
+            may_scatter &= splits | (path.depth > 0)
 
     # -- Direct light --------------------------------------------------------------------------------------------------
     path = _add_direct_light(estimators, path, event, may_scatter)
     if estimators.emission is not None:
         path = _add_media_emission(estimators, path, event, may_scatter)
     if path.emitter_sample is not None:
-        flies_aside = event.in_medium & (path.depth + 2 < limit)
+        flies_aside = event.in_medium & may_scatter & (path.depth + 2 < limit)
         emitter_sample = _sample_distant_emitter(estimators, path.ray, sampler, arrives)
         aimed = aim_at_emitter(estimators, emitter_sample, path.beta, sampler.next_1d(arrives), flies_aside)
         path = _add_side_flight(estimators, path, event, emitter_sample, aimed, flies_aside)
 
     # -- The next direction --------------------------------------------------------------------------------------------
-    samples = DirectionSamples(sampler.next_1d(arrives), sampler.next_2d(arrives))
+    samples = DirectionSamples(sampler.next_1d(arrives), sampler.next_2d(arrives), splits=splits)
     if path.emitter_sample is not None:
         samples.aimed = aimed
     elif estimators.near is not None and estimators.near.aims:
@@ -531,6 +541,8 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
         samples.aimed = estimators.near.aim(p, sampler.next_1d(aims), aims)
     onward = sample_next_direction(estimators, path.ray, event, samples, may_scatter)
     path.is_opaque |= arrives & ~onward.through
+    if splits is not None:
+        path.T *= dr.select(splits & onward.through, onward.pdf, 1)
     for factor in onward.factors:
         path.score = path.score.scale(factor)
     if path.emitter_sample is not None:
