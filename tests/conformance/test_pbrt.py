@@ -94,6 +94,14 @@ GRID = np.random.default_rng(5).uniform(0.2, 2, (3, 4, 2))
 LOW, HIGH = np.array([-0.5, -0.7, -0.9]), np.array([0.6, 0.5, 1.1])
 
 
+@pytest.mark.parametrize("line", ["", 'Integrator "volpath"\n'])
+def test_light_bounces_five_times_where_no_depth_is_given(tmp_path: Path, line: str) -> None:
+    """As in pbrt-v4; with six segments."""
+    (tmp_path / "a.pbrt").write_text(f"{line}WorldBegin\n{BALL}\n")
+    mivol.convert_pbrt(tmp_path / "a.pbrt", tmp_path / "a.xml")
+    assert 'name="max_depth" value="6"' in (tmp_path / "a.xml").read_text()
+
+
 def numbers(values: np.ndarray) -> str:
     return "[ " + " ".join(map(repr, np.ravel(values).tolist())) + " ]"
 

@@ -13,6 +13,7 @@ from refusals import assert_refused
 
 from mivol.errors import MivolError
 from mivol.files import read_projections
+from mivol.files.hdf5 import broken_links
 from mivol.files.scan_hdf5 import NO_DARKS, half_turns_in_radians, is_scan
 
 
@@ -190,3 +191,11 @@ def test_a_detector_whose_frames_are_missing_gives_way(tmp_path: Path) -> None:
     scan = read_projections(path)
     np.testing.assert_array_equal(scan.projections, FRAMES[VIEWS])
     np.testing.assert_allclose(scan.angles, np.radians(DEGREES[VIEWS]))
+
+
+def test_broken_links_at_the_top_name_their_targets(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["far"], file["gone"], file["here"] = h5py.ExternalLink("b.h5", "x"), h5py.SoftLink("/nowhere"), np.ones(2)
+        said = [str(error) for error in broken_links(file, tmp_path / "a.h5")]
+    targets = ("far to b.h5:x,", "gone to /nowhere,")
+    assert all(f"a link from {words}" in sentence for words, sentence in zip(targets, said, strict=True))
