@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import sys
@@ -241,6 +242,27 @@ def test_a_turn_on_the_spot_is_told_from_a_plane(offset: float, is_turn: bool) -
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     turn += np.outer([offset, 0.1 * offset, 0], [0, 0, 1])
     assert colmap_process.is_turn(3.7 * K @ turn @ np.linalg.inv(K), (640, 480)) == is_turn
+
+
+@pytest.mark.parametrize(("shift", "turned"), [(0.08, 0), (0.15, 1)])
+def test_a_turn_moves_points_by_a_tenth_of_the_width(shift: float, turned: int) -> None:
+    """With less, a homography without parallax may belong to a camera that stands still."""
+    pair = SimpleNamespace(inlier_matches=np.tile(np.arange(30)[:, None], 2), config="PANORAMIC", H=np.eye(3))
+    database = contextlib.nullcontext(
+        SimpleNamespace(
+            read_all_images=lambda: [SimpleNamespace(image_id=k, name=f"{k}.jpg", camera_id=1) for k in (1, 2)],
+            read_keypoints=lambda number: np.full((30, 2), 640 * shift * number) * [1, 0],
+            read_camera=lambda number: SimpleNamespace(width=640, height=480),
+            read_two_view_geometries=lambda: ([3], [pair]),
+        )
+    )
+    pycolmap = SimpleNamespace(
+        TwoViewGeometryConfiguration=SimpleNamespace(PANORAMIC="PANORAMIC", PLANAR_OR_PANORAMIC="PLANAR_OR_PANORAMIC"),
+        Database=SimpleNamespace(open=lambda path: database),
+        pair_id_to_image_pair=lambda number: (1, 2),
+    )
+    facts = colmap_process.describe_matches(pycolmap, Path("a.db"), {})
+    assert (facts["pairs"], facts["still"], facts["turned"]) == (1, 0, turned)
 
 
 def test_a_sequence_is_matched_with_neighbours_and_with_what_looks_alike() -> None:
