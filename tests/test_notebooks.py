@@ -103,6 +103,7 @@ def test_seven_representations(
     shorter = {'"field.effort": 2.0': '"field.effort": 0.5', '"field.effort": 4.0': '"field.effort": 1.0'}
     for last in ('"field.degree": 0', '"field.degree": 2', '"plenoxels", {"field.preset": "tiny"'):
         shorter[last] = f'{last}, "field.effort": 0.3'
+    shorter['"field.depth": 6, "field.effort": 0.5'] = '"field.depth": 5, "field.effort": 0.2'
     shorter['"gaussians.preset": "tiny"'] = '"gaussians.preset": "tiny", "gaussians.effort": 0.3'
     results = executed("seven_representations", shorter)["results"]
     assert list(results) == [
