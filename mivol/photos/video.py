@@ -11,6 +11,7 @@ small blocks. A frame without parallax is kept only after a large shift, before 
 
 from __future__ import annotations
 
+import logging
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -114,6 +115,8 @@ def _read(video: Path, options: list[str]) -> Iterator:
         raise MivolError('a video needs imageio-ffmpeg, which is not installed: pip install "mivol[video]".') from None
     if not video.is_file():
         raise refusal(video, "no file", "a video", "check the path")
+    # Of a phone's film, whose frames ffmpeg turns upright, it would warn that their size is another one than in the file.
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
     try:
         yield from imageio_ffmpeg.read_frames(str(video), output_params=options)
     except (OSError, RuntimeError, IndexError) as error:

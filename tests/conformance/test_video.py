@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,20 @@ def test_sharp_frames_of_a_moving_camera_are_kept(film: Path) -> None:
     blurred = video.sharpness(view(0, 2.0))
     assert min(video.sharpness(image) for image in kept) > 4 * blurred
     assert np.abs(kept[1].astype(int) - view(20)).mean() < 12  # the sharp frame of the second piece, after compression
+
+
+def test_films_of_a_phone_are_turned_upright(film: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A phone that is held upright stores its film lying, with a turn in the header. Nothing is said of it."""
+    import imageio_ffmpeg
+
+    turned = film.with_name("turned.mp4")
+    program = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-display_rotation", "90", "-i", str(film)]
+    subprocess.run([*program, "-c", "copy", str(turned)], check=True)
+    _, first = (sorted((video.extract_frames(each) / "images").iterdir())[0] for each in (film, turned))
+    lying = np.asarray(PIL.Image.open(film.with_suffix("") / "images" / first.name)).astype(int)
+    upright = np.asarray(PIL.Image.open(first))
+    assert upright.shape == (128, 96, 3) and np.abs(np.rot90(lying) - upright).mean() < 2
+    assert not caplog.records
 
 
 def test_frames_are_not_taken_twice(film: Path) -> None:
