@@ -46,7 +46,7 @@ from mivol.scene_graph import list_values, traverse
 from mivol.transport.estimators.lighting.emitters import find_bounding_ball
 from mivol.transport.media.body import Body
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
-from mivol.transport.media.medium_view import MediumView, medium_kind
+from mivol.transport.media.medium_view import Blend, MediumView, medium_kind
 from mivol.transport.media.octree_extinction import OctreeExtinction
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.box import Box
@@ -411,10 +411,11 @@ class Needs(ShapeFacts):
             return None
         return replace(self, lamp_noise=None, branch_noise=None, mirror_noise=None, **_sort_parameters(differentiated))
 
-    def with_views(self, survey: SceneSurvey, asymmetries: list[mi.Float | None]) -> Needs:
-        """The same facts with the media viewed anew: a recording reads their arrays from the scene, all but ``asymmetries``."""
+    def with_views(self, survey: SceneSurvey, phases: list[tuple[mi.Float | None, Blend | None]]) -> Needs:
+        """The same facts with the media viewed anew: a recording reads their arrays from the scene, all but ``phases``."""
         views = (b.view(survey.grids) for b in self.boundaries)
-        return replace(self, views=tuple(replace(v, asymmetry=g) for v, g in zip(views, asymmetries, strict=True)))
+        known = zip(views, phases, strict=True)
+        return replace(self, views=tuple(replace(v, asymmetry=g, blend=blend) for v, (g, blend) in known))
 
     def make_media(self, scene: mi.Scene, bodies: Sequence[Body], size: float, tracer: mi.Scene | None) -> SceneMedia:
         """Build the media of the scene among its surfaces.

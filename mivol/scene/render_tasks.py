@@ -25,7 +25,7 @@ from mivol.space import lattice_from_world
 from mivol.transport.estimators.scores import Primal, Replay, Tangent
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
 from mivol.transport.media.extinction import to_components
-from mivol.transport.media.medium_view import read_asymmetry
+from mivol.transport.media.medium_view import Blend, read_asymmetry, read_blend
 from mivol.transport.path.derivatives import carry_tangents, prepare_derivatives, replay_branches
 from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.film import CameraRays, LightOfOwnRays, RenderSamples, adjoint_rays, count_passes, render_on_film
@@ -54,8 +54,8 @@ class PreparedArrays:
         tracer: scene of the surfaces alone; None to trace the whole scene.
         balls: where emitters are (:func:`mivol.transport.estimators.lighting.emitters.read_balls`); None while ``dr.freeze``
             records.
-        asymmetries: the ``g`` of the stock ``hg`` of each medium, which Mitsuba hides from Dr.Jit; None for another phase
-            function.
+        phases: for each medium, the ``g`` of its stock ``hg``, and its stock ``blendphase``, which Mitsuba hides from Dr.Jit;
+            None for another phase function.
     """
 
     readings: Readings
@@ -64,7 +64,7 @@ class PreparedArrays:
     placements: mi.Float64 | None
     tracer: mi.Scene | None
     balls: mi.Float | None
-    asymmetries: list[mi.Float | None] = field(default_factory=list)
+    phases: list[tuple[mi.Float | None, Blend | None]] = field(default_factory=list)
 
 
 @dataclass
@@ -97,7 +97,8 @@ class PlannedScene:
 
     def read_arrays(self) -> PreparedArrays:
         """The arrays of the next call. The derivatives of a ``g`` belong to one step, so they are not kept."""
-        return replace(self.arrays, asymmetries=[read_asymmetry(boundary.medium) for boundary in self.needs.boundaries])
+        media = [boundary.medium for boundary in self.needs.boundaries]
+        return replace(self.arrays, phases=[(read_asymmetry(medium), read_blend(medium)) for medium in media])
 
     def is_for(self, state: SceneState, spp: int) -> bool:
         """Whether a scene in this state, with so many samples, has the same facts."""
@@ -163,7 +164,7 @@ class RenderTask(RecordedTask):
     def build_estimators(self, scene: mi.Scene, arrays: PreparedArrays) -> Estimators:
         """Build the planned estimators over the arrays of the scene."""
         with with_placements(arrays.placements, self.places):
-            needs = self.needs.with_views(self.survey, arrays.asymmetries)
+            needs = self.needs.with_views(self.survey, arrays.phases)
             if arrays.light is not None:
                 needs = replace(needs, media_light=MediaLight(*arrays.light))
             made = arrays.readings, arrays.tracer, arrays.balls

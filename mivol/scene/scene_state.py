@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from mivol.scene.stand_in import ARRAYS, FOUND_SENSOR, RECORDED_FILM, describe_kind
 from mivol.scene_graph import find_children, list_values, read_value, traverse
+from mivol.transport.media.medium_view import read_blend
 from mivol.transport.path.film import find_batch_views
 
 FOLLOWED = ("data", "value")
@@ -116,7 +117,7 @@ class SceneState:
             if numbers is None or not dr.is_jit_v(numbers):
                 self._sort(owner, False, value if isinstance(value, int | float | str | bool) else str(value))
                 continue
-            is_followed, kept = _is_followed(owner, key), dr.detach(numbers)
+            is_followed, kept = _is_followed(params, key), dr.detach(numbers)
             indices = tuple(dr.detail.collect_indices(kept))
             known = before[len(self.values)][0] if is_followed and len(self.values) < len(before) else indices
             if indices != known and kept.state == dr.VarState.Literal:
@@ -160,11 +161,14 @@ def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:
     foreign = sorted({type(node).__name__ for node in nodes if type(node).__module__.partition(".")[0] != "mitsuba"})
     if foreign:
         return f"{foreign[0]} is a Python plugin, whose arrays may be hidden"
-    hiding = sorted({node.class_name() for node in nodes} & set(HIDING))
+    media = [sensor.get_medium(), *(node for node in params.hierarchy if isinstance(node, mi.Medium))]
+    known = set(HIDING) - ({"BlendPhaseFunction"} if all(_is_closed(medium) for medium in media) else set())
+    hiding = sorted({node.class_name() for node in nodes} & known)
     if hiding:
         return f"Dr.Jit cannot record a {hiding[0]}{HIDING[hiding[0]]}"
-    owners = ((key, params.properties[key][2], value) for key, value in list_values(params))
-    lost = [key for key, owner, value in owners if find_gradient_array(value) is not None and not _is_followed(owner, key)]
+    lost = [
+        key for key, value in list_values(params) if find_gradient_array(value) is not None and not _is_followed(params, key)
+    ]
     return f"a recording does not follow the derivative by {lost[0]}" if lost else None
 
 
@@ -174,13 +178,22 @@ def find_gradient_array(value: Any) -> Any | None:
     return array if array is not None and dr.is_diff_v(array) and dr.grad_enabled(array) else None
 
 
-def _is_followed(owner: mi.Object, key: str) -> bool:
+def _is_closed(medium: mi.Medium | None) -> bool:
+    """Whether no kernel calls the phase function of a medium, so that its arrays are inputs."""
+    phase = None if medium is None else medium.phase_function()
+    names = "HGPhaseFunction", "IsotropicPhaseFunction"
+    return phase is None or phase.class_name() in names or read_blend(medium) is not None
+
+
+def _is_followed(params: mi.SceneParameters, key: str) -> bool:
     """Whether a recording follows the values of a parameter."""
+    owner = params.properties[key][2]
     if _is_of_mivol(owner):
         return True
     if owner.class_name() == "HGPhaseFunction":
         # Of a medium: its ``g`` is an input. A lobe of a mixture is called through its pointer, where ``g`` is hidden.
-        return key.endswith("phase_function.g")
+        parent = params.hierarchy[owner][0]
+        return isinstance(parent, mi.Medium) or (parent is not None and parent.class_name() == "BlendPhaseFunction")
     name = key.rpartition(".")[2]
     if isinstance(owner, mi.Volume | mi.Texture):
         return name in FOLLOWED

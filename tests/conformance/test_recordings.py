@@ -98,6 +98,11 @@ SCENES: dict[str, tuple[Callable[[], mi.Scene], int, list[str]]] = {
         4,
         [INSIDE + key for key in ("phase_function.g", "sigma_t.data")],
     ),
+    "blend": (
+        lambda: smoke_under(phase={"type": "blendphase", "weight": 0.3, "a": {"type": "hg"}, "b": {"type": "hg", "g": -0.3}}),
+        4,
+        [INSIDE + "phase_function." + key for key in ("weight.value.value", "phase_0.g", "phase_1.g")],
+    ),
     "lamp": (lamp_in_fog, 5, [INSIDE + "sigma_t.value.value", "floor.bsdf.reflectance.value", "lamp.position"]),
     "maps": (lit_by_maps, 3, ["sky.data", "sky.scale", "spot.beam_width"]),
     "surfaces": (before_painted_faces, 3, ["wall.vertex_color", "ball.bsdf.alpha"]),
@@ -648,7 +653,7 @@ def test_what_cannot_be_recorded_is_named() -> None:
     pencils = mi.load_dict(batch_of(pencil((0, -4, 0), (0, 1, 0))))
     assert find_hidden_arrays(scene, pencils) == "the sensor is a RadianceMeter"
     microflakes = {"type": "sggx", "S": grid_volume("gridvolume", np.ones((1, 1, 1, 6), np.float32), PLACE)}
-    lobes = {"type": "blendphase", "weight": 0.3, "a": {"type": "isotropic"}, "b": {"type": "hg"}}
+    lobes = {"type": "blendphase", "weight": 0.3, "a": {"type": "rayleigh"}, "b": {"type": "hg"}}
     for phase, sentence in (
         (microflakes, "Dr.Jit cannot record a SGGXPhaseFunction"),
         (lobes, "Dr.Jit cannot record a BlendPhaseFunction; mivol_mixture can be recorded"),
@@ -660,6 +665,12 @@ def test_what_cannot_be_recorded_is_named() -> None:
     assert find_hidden_arrays(scene, scene.sensors()[0]) is None
     dr.enable_grad(params[INSIDE + "phase_function.g"])
     assert find_hidden_arrays(scene, scene.sensors()[0]) is None
+    blend = {"type": "blendphase", "weight": 0.3, "a": {"type": "isotropic"}, "b": {"type": "hg"}}
+    blended, other = smoke_under(phase=blend), box_of(medium("homogeneous", 1.0, 0.5, phase={"type": "rayleigh"}), PLACE)
+    assert find_hidden_arrays(blended, blended.sensors()[0]) is None
+    # A kernel that calls another phase function calls all of them.
+    beside = smoke_under(phase=blend, other=other)
+    assert find_hidden_arrays(beside, beside.sensors()[0]) == sentence
     lobed = smoke_under(phase={"type": "mivol_mixture", "a": {"type": "hg"}, "b": {"type": "isotropic"}})
     key = next(key for key in mi.traverse(lobed).properties if key.endswith(".g"))
     dr.enable_grad(mi.traverse(lobed)[key])

@@ -34,7 +34,21 @@ from mivol.transport.media.stock_grids import StockGrids
 from mivol.transport.traversal.box import Box
 from mivol.transport.traversal.lattice import Lattice
 
-__all__ = ["ASYMMETRY", "MediumView", "nested_field", "read_asymmetry", "view_medium"]
+__all__ = ["ASYMMETRY", "Blend", "MediumView", "nested_field", "read_asymmetry", "read_blend", "view_medium"]
+
+
+@dataclass
+class Blend:
+    """Two phase functions of Henyey and Greenstein side by side, with derivatives.
+
+    Attributes:
+        weight: share of the second one [1], to be clipped to [0, 1].
+        first, second: ``g`` of each function [1]; 0 for an ``isotropic``.
+    """
+
+    weight: mi.Float
+    first: mi.Float
+    second: mi.Float
 
 
 @dataclass
@@ -60,6 +74,7 @@ class MediumView:
             of a stock grid outside the box, where mivol has no emission.
         is_isotropic: whether the phase function is Mitsuba's ``isotropic``.
         asymmetry: the ``g`` of Mitsuba's ``hg`` [1], with derivatives; None for another phase function.
+        blend: the phase function, if it is Mitsuba's ``blendphase`` of ``isotropic`` or ``hg`` with one weight; else None.
     """
 
     medium: mi.Medium
@@ -76,6 +91,7 @@ class MediumView:
     numbers: dict[str, float | mi.Float | mi.Color3f] = field(default_factory=dict)
     is_isotropic: bool = False
     asymmetry: mi.Float | None = None
+    blend: Blend | None = None
 
     def holds(self, volume: mi.Volume, p: mi.Point3f) -> mi.Bool:
         """Whether a point lies in the box of a stock volume of emission; true for volumes of mivol, which are 0 outside."""
@@ -181,6 +197,7 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, grids: StockGrid
         numbers,
         is_isotropic,
         asymmetry,
+        read_blend(medium),
     )
 
 
@@ -200,12 +217,29 @@ def read_asymmetry(medium: mi.Medium) -> mi.Float | None:
     phase = medium.phase_function()
     if phase is None or phase.class_name() != "HGPhaseFunction":
         return None
-    g = traverse(phase)["g"]
-    if not dr.grad_enabled(g):
-        # A literal would make a new kernel for each number.
-        g = mi.Float(dr.detach(g))
-        dr.make_opaque(g)
-    return g
+    return _keep_number(traverse(phase)["g"])
+
+
+def read_blend(medium: mi.Medium) -> Blend | None:
+    """The phase function of a medium, if it is a stock ``blendphase`` of ``isotropic`` or ``hg`` with one weight; else None."""
+    phase = medium.phase_function()
+    if phase is None or phase.class_name() != "BlendPhaseFunction":
+        return None
+    children, params = find_children(phase), traverse(phase)
+    lobes = [children["phase_0"].class_name(), children["phase_1"].class_name()]
+    known = {"HGPhaseFunction", "IsotropicPhaseFunction"}
+    if not known.issuperset(lobes) or "weight.value.value" not in params or len(params["weight.value.value"]) != 1:
+        return None
+    weight, *each = (params[key] if key in params else mi.Float(0) for key in ("weight.value.value", "phase_0.g", "phase_1.g"))
+    return Blend(*map(_keep_number, (weight, *each)))
+
+
+def _keep_number(number: mi.Float) -> mi.Float:
+    """Keep the derivatives of a number; without derivatives, make it an array: each literal would make a new kernel."""
+    if not dr.grad_enabled(number):
+        number = mi.Float(dr.detach(number))
+        dr.make_opaque(number)
+    return number
 
 
 def _read_microflakes(medium: mi.Medium) -> list[mi.Float] | None:

@@ -3,7 +3,8 @@
 Conventions. A body is a medium behind a boundary. Rays are clipped to boundaries that are boxes or balls; other boundaries are
 traced.
 
-Phase functions. Mitsuba's ``isotropic`` and ``hg`` are evaluated in closed form, all others by Mitsuba. A kernel that calls a
+Phase functions. Mitsuba's ``isotropic`` and ``hg``, and blends of two of them by one weight, are evaluated in closed form, all
+others by Mitsuba. A kernel that calls a
 phase function through its pointer contains a call for every phase function of the process. Dr.Jit cannot record such a kernel
 while one of them is an ``hg`` whose ``g`` was set, since Mitsuba 3.9.1 hides this array. The closed forms need no call, and
 follow ``g`` as any other argument.
@@ -16,12 +17,13 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
+from operator import attrgetter
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.phase.closed_forms import INV_FOUR_PI, angle_between, eval_hg, sample_hg, scattered_direction
+from mivol.phase.closed_forms import INV_FOUR_PI, ScatteringAngle, angle_between, eval_hg, sample_hg, scattered_direction
 from mivol.transport.media.body import Body, is_followed
 from mivol.transport.media.extinction import to_scene_channels
 from mivol.transport.traversal.box import opaque_numbers, opaque_rows
@@ -294,6 +296,10 @@ def _locate(scene: mi.Scene, ray: mi.Ray3f, size: mi.Float) -> mi.MediumPtr:
 # -- Phase functions of the media -------------------------------------------------------------------------------------------
 
 
+BLEND = "blend.weight", "blend.first", "blend.second"
+"""The numbers of a blend, by their paths in a view."""
+
+
 class ScenePhases:
     """The phase functions of some media.
 
@@ -305,9 +311,12 @@ class ScenePhases:
     """
 
     def __init__(self, bodies: list[Body]) -> None:
+        self._count = len(bodies)
         self._even = [b for b in bodies if b.view.is_isotropic]
         self._peaked = [b for b in bodies if b.view.asymmetry is not None]
-        self._others = [b for b in bodies if not b.view.is_isotropic and b.view.asymmetry is None]
+        self._blended = [b for b in bodies if b.view.blend is not None]
+        closed = self._even + self._peaked + self._blended
+        self._others = [b for b in bodies if not any(b is other for other in closed)]
         phases = [b.view.medium.phase_function() for b in self._others]
         self.has_microflakes = any(p is not None and int(p.flags()) & int(mi.PhaseFunctionFlags.Microflake) for p in phases)
 
@@ -317,6 +326,8 @@ class ScenePhases:
         if self._peaked:
             own = mi.Spectrum(eval_hg(angle_between(mei.wi, d), self._asymmetry(mei)))
             value = self._select(self._peaked, mei, own, value)
+        if self._blended:
+            value = self._select(self._blended, mei, mi.Spectrum(self._eval_blend(mei, angle_between(mei.wi, d))), value)
         if self._others:
             on = active & self._is_in(self._others, mei)
             own, _ = mei.medium.phase_function().eval_pdf(mi.PhaseFunctionContext(None), mei, d, on)
@@ -329,6 +340,9 @@ class ScenePhases:
         if self._peaked:
             own = dr.detach(eval_hg(angle_between(mei.wi, d), self._asymmetry(mei)))
             pdf = self._select(self._peaked, mei, own, pdf)
+        if self._blended:
+            own = dr.detach(self._eval_blend(mei, angle_between(mei.wi, d)))
+            pdf = self._select(self._blended, mei, own, pdf)
         if self._others:
             phase = mei.medium.phase_function()
             _, own = phase.eval_pdf(mi.PhaseFunctionContext(None), mei, d, active & self._is_in(self._others, mei))
@@ -360,6 +374,12 @@ class ScenePhases:
             angle = sample_hg(direction.x, g)
             own = scattered_direction(mei.wi, angle, direction.y), mi.Spectrum(1), eval_hg(angle, g)
             found = self._select(self._peaked, mei, own, found)
+        if self._blended:
+            weight, first, second = (dr.detach(self._number(self._blended, mei, name)) for name in BLEND)
+            angle = sample_hg(direction.x, dr.select(component < weight, second, first))
+            pdf = dr.detach(self._eval_blend(mei, angle))
+            own = scattered_direction(mei.wi, angle, direction.y), mi.Spectrum(1), pdf
+            found = self._select(self._blended, mei, own, found)
         if self._others:
             on = active & self._is_in(self._others, mei)
             found = self._select(self._others, mei, self._sample_others(mei, component, direction, on), found)
@@ -378,17 +398,26 @@ class ScenePhases:
             weight, pdf = dr.select(even, f / INV_FOUR_PI, weight), dr.select(even, INV_FOUR_PI, pdf)
         return wo, weight, pdf
 
+    def _eval_blend(self, mei: mi.MediumInteraction3f, angle: ScatteringAngle) -> mi.Float:
+        """The blend of the medium of each lane [1/sr]."""
+        weight, first, second = (self._number(self._blended, mei, name) for name in BLEND)
+        return dr.lerp(eval_hg(angle, first), eval_hg(angle, second), dr.clip(weight, 0, 1))
+
     def _asymmetry(self, mei: mi.MediumInteraction3f) -> mi.Float:
         """The ``g`` of the medium of each lane [1]."""
-        first, *rest = self._peaked
-        g = mi.Float(first.view.asymmetry)
-        for body in rest:
-            g = dr.select(mei.medium == mi.MediumPtr(body.view.medium), body.view.asymmetry, g)
-        return g
+        return self._number(self._peaked, mei, "asymmetry")
+
+    @staticmethod
+    def _number(bodies: list[Body], mei: mi.MediumInteraction3f, name: str) -> mi.Float:
+        """A number of the phase function of each lane's medium, by the path of its attribute in the view of the medium."""
+        (_, number), *rest = [(body.view.medium, attrgetter(name)(body.view)) for body in bodies]
+        for medium, other in rest:
+            number = dr.select(mei.medium == mi.MediumPtr(medium), other, number)
+        return mi.Float(number)
 
     def _select(self, bodies: list[Body], mei: mi.MediumInteraction3f, own: tuple, rest: tuple) -> tuple:
         """``own`` in the lanes of some media, ``rest`` in the others."""
-        if len(bodies) == len(self._even) + len(self._peaked) + len(self._others):
+        if len(bodies) == self._count:
             return own
         return dr.select(self._is_in(bodies, mei), own, rest)
 
