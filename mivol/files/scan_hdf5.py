@@ -44,6 +44,7 @@ ANGLES: dict[str, float] = {
     "degrees": np.pi / 180,
     "degree": np.pi / 180,
     "deg": np.pi / 180,
+    "\u00b0": np.pi / 180,
     "radians": 1.0,
     "radian": 1.0,
     "rad": 1.0,
@@ -51,11 +52,16 @@ ANGLES: dict[str, float] = {
 
 #: units of a length -> factor to mm.
 LENGTHS: dict[str, float] = {
-    **dict.fromkeys(("m", "meter", "metre", "meters", "metres"), 1e3),
-    **dict.fromkeys(("mm", "millimeter", "millimetre"), 1.0),
-    **dict.fromkeys(("um", "\u00b5m", "\u03bcm", "micron", "microns", "micrometer", "micrometre"), 1e-3),
-    **dict.fromkeys(("cm", "centimeter", "centimetre"), 10.0),
-    **dict.fromkeys(("nm", "nanometer", "nanometre"), 1e-6),
+    f"{prefix}{name}": factor
+    for factor, letters, prefix in (
+        (1e3, ("m",), ""),
+        (10.0, ("cm",), "centi"),
+        (1.0, ("mm",), "milli"),
+        (1e-3, ("um", "\u00b5m", "\u03bcm", "micron", "microns"), "micro"),
+        (1e-6, ("nm",), "nano"),
+    )
+    for prefix, names in (("", letters), (prefix, ("meter", "metre", "meters", "metres")))
+    for name in names
 }
 
 VIEW, FLAT, DARK = 0, 1, 2
@@ -291,6 +297,7 @@ def _nxtomo(file: Any, path: Path, entry: str, names: Mapping[str, str]) -> _Sca
     angles = None if "angles" in names else _nxtomo_angles(file, path, entry, holder, key)
     detector = file[holder] if "pixel_size" in " ".join(file[holder]) else _first_detector(file, entry)
     pitch = tuple(_length(detector, f"{axis}_pixel_size") for axis in "yx") if detector is not None else (None,)
+    notes += _describe_unit(detector, "x_pixel_size")
     source = next((file[n] for n in (f"{entry}/instrument/source",) if n in file), None)
     distances = (_length(source, "distance"), _length(detector, "distance"))
     return _Scan(
@@ -370,6 +377,16 @@ def _length(holder: Any, name: str) -> float | None:
     factor = LENGTHS.get(to_text(item.attrs.get("units", "m")).strip().lower())
     value = np.asarray(item, np.float64).ravel() if factor and np.issubdtype(item.dtype, np.number) else np.empty(0)
     return float(value[0] * factor) if value.size and np.isfinite(value[0]) and value[0] else None
+
+
+def _describe_unit(holder: Any, name: str) -> list[str]:
+    """What is assumed of a length without a unit, and that a length of an unknown unit is not read."""
+    if holder is None or name not in holder:
+        return []
+    unit = to_text(holder[name].attrs.get("units", "")).strip()
+    if unit and unit.lower() not in LENGTHS:
+        return [f"{name} is in {unit!r}, which is no known unit of length: it is not read; scan.pitch sets it"]
+    return [] if unit else [f"{name} has no unit and is taken as metres, as NeXus has them; scan.pitch sets it"]
 
 
 def _dataset(file: Any, path: Path, group: str, name: str) -> Any:

@@ -90,6 +90,10 @@ def axis_from_mirrors(y: np.ndarray, angles: np.ndarray, n_views: int = 360) -> 
     return Axis(column, float(np.hypot(sigma, floor)), f"mirror images, {len(here)} views")
 
 
+LEAST_MASS = 0.1
+"""Smallest mass of a row over that of the heaviest row, for its centre of mass to count."""
+
+
 def axis_from_moments(y: np.ndarray, angles: np.ndarray) -> Axis:
     """Find the axis from the centre of mass of each view, which follows ``c + a cos(theta) + b sin(theta)`` (Ludwig).
 
@@ -102,8 +106,13 @@ def axis_from_moments(y: np.ndarray, angles: np.ndarray) -> Axis:
         angles: (views,) [rad].
     """
     mass = y.sum(-1)
-    if not (mass > 0).all():
-        raise MivolError("Found a row of a view with no absorption in it, expected an object in every row and view.")
+    rows = np.flatnonzero((mass > LEAST_MASS * mass.mean(0).max()).all(0))
+    if mass.max() <= 0 or not len(rows):
+        raise MivolError(
+            "Found no row with an object in every view, expected one: give scan.axis_offset, or data.find_axis = false for the "
+            "middle of the detector."
+        )
+    y, mass = y[:, rows], mass[:, rows]
     centres = (y @ np.arange(y.shape[-1])) / mass
     design = np.stack([np.ones_like(angles), np.cos(angles), np.sin(angles)], 1)
     columns, sigmas = np.transpose([_fit_first_coefficient(design, centres[:, row]) for row in range(y.shape[1])])
@@ -152,7 +161,8 @@ def find_axis(y: np.ndarray, weights: np.ndarray, angles: np.ndarray) -> Axis:
     The result is the column of the smaller standard deviation. The refined column's includes the bumps of the misfit
     (``MISFIT_ERROR``), and is at least half of the distance between both, because wrong light moves it by more than noise does.
     The column of mirror images also holds if reconstructions have no least misfit nearby: the object is wider than the
-    detector, or the light is wrong.
+    detector, or the light is wrong. That of moments holds then if every view sees the whole object, as in scans of less than
+    half a turn.
 
     If there are many more views than columns, neighbours are averaged first. In half a turn few views have an opposite view,
     and their noise may hide the resemblance.
@@ -172,7 +182,7 @@ def find_axis(y: np.ndarray, weights: np.ndarray, angles: np.ndarray) -> Axis:
     try:
         fine = axis_from_reconstructions(y, weights, angles, rough.column)
     except MivolError:
-        if is_sure:
+        if is_sure or _sees_whole_object(y):
             return replace(rough, method=f"{rough.method}; no column nearby predicts half of the views best")
         raise MivolError(
             f"found no rotation axis: opposite views show no mirror images, and no column near {rough.column:.0f} (by the "
@@ -187,6 +197,19 @@ def find_axis(y: np.ndarray, weights: np.ndarray, angles: np.ndarray) -> Axis:
     if apart > FAR * rough.uncertainty:
         return replace(rough, method=f"{rough.method}; reconstructions say {fine.column:.2f}, which does not count")
     return rough
+
+
+AIR_SHARE, MASS_SCATTER = 0.02, 0.02
+"""Most that the mean of an edge may be over the largest mean of a column, and scatter of the mass over views, of an object that
+all views see as a whole."""
+
+
+def _sees_whole_object(y: np.ndarray) -> bool:
+    """Whether each view (views, rows, cols) has air at both edges, and all have the same sum, which is the object's mass."""
+    profile, width = y.mean(1), max(2, y.shape[2] // 20)
+    edges = np.abs([profile[:, :width].mean(1), profile[:, -width:].mean(1)])
+    mass = profile.sum(1)
+    return bool(edges.max() < AIR_SHARE * profile.max() and np.std(mass) < MASS_SCATTER * np.mean(mass))
 
 
 VIEWS_A_COLUMN = 2

@@ -44,6 +44,27 @@ def test_frames_of_the_alignment_are_no_views(tmp_path: Path) -> None:
     assert len(read_projections(path).angles) == 5
 
 
+@pytest.mark.parametrize(
+    ("unit", "pitch", "note"),
+    [
+        ("micrometers", 2e-3, ""),
+        ("", 2e3, "x_pixel_size has no unit and is taken as metres"),
+        ("furlong", None, "x_pixel_size is in 'furlong', which is no known unit of length: it is not read; scan.pitch"),
+    ],
+)
+def test_units_of_a_pixel_are_read_or_said(tmp_path: Path, unit: str, pitch: float | None, note: str) -> None:
+    path = write_nxtomo(tmp_path / "a.nxs")
+    with h5py.File(path, "a") as file:
+        attributes = file["entry/instrument/detector/x_pixel_size"].attrs
+        del attributes["units"]
+        attributes.update({"units": unit} if unit else {})
+        file["entry/sample/rotation_angle"].attrs["units"] = "\u00b0"
+    scan = read_projections(path)
+    assert (scan.pitch and scan.pitch[1]) == (pitch and pytest.approx(pitch))
+    assert any(line.startswith(note) for line in scan.notes[1:]) if note else len(scan.notes) == 1
+    assert scan.angles[1] == pytest.approx(np.radians(36))
+
+
 def test_the_first_of_several_scans_is_read(tmp_path: Path) -> None:
     """And the sentence names the others; GDA's entry lies in another entry."""
     path = write_nxtomo(write_nxtomo(tmp_path / "a.nxs", "entry1/tomo_entry"), "entry0000", angles=DEGREES + 1)
