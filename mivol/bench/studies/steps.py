@@ -30,7 +30,7 @@ of 24^2 pixels.
 
 Milliseconds are wall times: medians over the steps after the first ``WARM`` ones, in which both integrators compile. A ratio is
 the time of ``prbvolpath`` over the time of mivol, without regard to their noise (``mivol bench everyday`` compares errors).
-Launches are kernels, copies and fills of one step; those in brackets leave out the update of the parameter.
+Launches are kernels, copies and fills of a step; the numbers in brackets leave out the update of the parameter.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ class _Loop:
         self.render(differentiates)
 
     def count_render_launches(self, differentiates: bool) -> int:
-        """Launches of a step without those that put its value."""
+        """Launches of a step without the update of its value."""
         self.put_value(differentiates)
         return count_launches(partial(self.render, differentiates))
 
@@ -256,7 +256,7 @@ def time_first_step(scene: str, who: str) -> str:
 
 
 def choose_scenes(names: tuple[str, ...]) -> dict[str, EverydayScene]:
-    """The scenes of these names; those of this study come last."""
+    """The scenes with these names; the scenes of this study come last."""
     scenes = chosen_scenes([name for name in names if name not in OWN_SCENES])
     return scenes | {name: scene for name, scene in OWN_SCENES.items() if name in names}
 

@@ -74,7 +74,7 @@ class MediumView:
             of a stock grid outside the box, where mivol has no emission.
         is_isotropic: whether the phase function is Mitsuba's ``isotropic``.
         asymmetry: the ``g`` of Mitsuba's ``hg`` [1], with derivatives; None for another phase function.
-        blend: the phase function, if it is Mitsuba's ``blendphase`` of ``isotropic`` or ``hg`` with one weight; else None.
+        blend: Mitsuba's ``blendphase`` of ``isotropic`` or ``hg`` with a single weight, or None.
     """
 
     medium: mi.Medium
@@ -221,7 +221,7 @@ def read_asymmetry(medium: mi.Medium) -> mi.Float | None:
 
 
 def read_blend(medium: mi.Medium) -> Blend | None:
-    """The phase function of a medium, if it is a stock ``blendphase`` of ``isotropic`` or ``hg`` with one weight; else None."""
+    """The stock ``blendphase`` of a medium, or None. The parts must be ``isotropic`` or ``hg``, with a single weight."""
     phase = medium.phase_function()
     if phase is None or phase.class_name() != "BlendPhaseFunction":
         return None

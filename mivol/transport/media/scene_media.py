@@ -3,7 +3,7 @@
 Conventions. A body is a medium behind a boundary. Rays are clipped to boundaries that are boxes or balls; other boundaries are
 traced.
 
-Phase functions. Mitsuba's ``isotropic`` and ``hg``, and blends of two of them by one weight, are evaluated in closed form, all
+Phase functions. Mitsuba's ``isotropic`` and ``hg``, and their blends with a single weight, are evaluated in closed form, all
 others by Mitsuba. A kernel that calls a
 phase function through its pointer contains a call for every phase function of the process. Dr.Jit cannot record such a kernel
 while one of them is an ``hg`` whose ``g`` was set, since Mitsuba 3.9.1 hides this array. The closed forms need no call, and

@@ -279,7 +279,7 @@ def read_balls(scene: mi.Scene) -> mi.Float | None:
 
 
 def _find_balls(scene: mi.Scene, numbers: mi.Float | None) -> list[list[mi.Float] | None]:
-    """Centre and radius of each emitter of a scene; None for an emitter at infinity.
+    """Centre and radius of each emitter of a scene, or None at infinity.
 
     Args:
         scene: Mitsuba's scene.

@@ -48,7 +48,7 @@ SUN_RADIUS = 0.06
 """Angle around the direction of the sun in which its table is used [rad]."""
 
 SUN_DRAWS, SUN_CANDIDATES = 512, 64
-"""Number of directions whose neighbours are counted to find the sun of an environment, and how many of them may be the sun."""
+"""Number of directions drawn to find the sun of an environment, and number of candidates among these directions."""
 
 MIN_TABLE, UNKNOWN = 0.02, 0.3
 """Least transmittance T_0 that a table may claim, and the transmittance that stands for light from other directions than the
