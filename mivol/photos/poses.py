@@ -106,7 +106,12 @@ class Poses:
                 f"photograph what lies between {first} and {self.posed[-1]}, or put another place into a folder of its own"
             )
         apart = {name for names in self.others for name in names}
-        if unposed := [name for name in self.unposed if name not in apart]:
+        if elsewhere := [name for name in self.unposed if name not in apart and self._is_elsewhere(name)]:
+            lines.append(
+                f"without a pose: {name_first(elsewhere)}, which match each other better than photographs with poses; "
+                f"photograph what lies between them and {self.posed[-1]}, or put another place into a folder of its own"
+            )
+        if unposed := [name for name in self.unposed if name not in apart and name not in elsewhere]:
             lines.append(f"without a pose: {name_first(list(map(self._name_unposed, unposed)))}; {AGAIN}")
         return "\n".join(lines)
 
@@ -120,6 +125,11 @@ class Poses:
             "cameras do not stand where you walked, put something different beside each side of the subject, and photograph "
             "it again"
         )
+
+    def _is_elsewhere(self, name: str) -> bool:
+        """Whether a photograph without a pose has most points in common with another one without a pose."""
+        partner, points = self.best.get(name, ("", 0))
+        return points >= FEW and partner in self.unposed
 
     def _name_unposed(self, name: str) -> str:
         """A photograph without a pose, with the reason that its matches show."""

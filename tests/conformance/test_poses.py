@@ -389,7 +389,16 @@ def test_poses_are_found_one_by_one_if_photographs_are_left_out_or_points_disagr
 
 def test_a_photograph_of_another_thing_is_named() -> None:
     said = poses.Poses(Path("m"), ("a", "b", "c"), ("d", "e"), 0.5, 9, 1, best={"d": ("a", 0), "e": ("b", 80)}).describe()
-    assert "without a pose: d (shows no part of another photograph), e; " in said
+    assert "without a pose: d (shows no part of another photograph), e; " in said and "each other" not in said
+
+
+def test_photographs_of_another_place_are_named() -> None:
+    """Those whose best partner has no pose either; COLMAP makes models of ten photographs and more alone."""
+    best = {"d": ("e", 50), "e": ("d", 50), "f": ("a", 80), "g": ("d", 49)}
+    said = poses.Poses(Path("m"), ("a", "b", "c"), ("d", "e", "f", "g"), 0.5, 9, 1, best=best).describe()
+    assert "without a pose: d, e, which match each other better than photographs with poses; photograph what lies" in said
+    assert "between them and c, or put another place into a folder of its own" in said
+    assert "without a pose: f, g (few matches: 49 points in common with d); photograph again" in said
 
 
 @pytest.mark.parametrize(("against", "is_said"), [(12, False), (13, True)])
