@@ -45,6 +45,12 @@ def test_shifts_of_a_slice_are_found(variant_rgb) -> None:
     assert found.after.mean() < 0.1 * found.before.mean()
 
 
+def test_slopes_by_shifts_and_turns() -> None:
+    """Of the readings u v: u and v, and u^2 - v^2 for a turn about the middle."""
+    v, u = np.indices((5, 7)) - np.array([2, 3])[:, None, None]
+    np.testing.assert_allclose(alignment._slopes((1.0 * u * v)[None])[0], np.stack([u, v, u**2 - v**2], -1), atol=1e-12)
+
+
 def test_deviations_of_moves_are_those_of_the_errors(variant_rgb) -> None:
     """1,000 quanta, three seeds: errors of 72 moves are within a factor 1.6 of their deviations. Chance alone scatters the
     ratio by 9 %; errors of the volume add to those of the noise. Residuals counted as independent would give 1.9."""
