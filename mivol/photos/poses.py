@@ -16,7 +16,7 @@ import json
 import shutil
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -160,7 +160,7 @@ def find_poses(folder: Path, say: Callable[[str], None] = lambda line: None, is_
     _begin_work(work, images, names)
     try:
         aliases = {name: f"blank-{number:05d}{Path(name).suffix}" for number, name in enumerate(names) if " " in name}
-        masks = _prepare(images, names, work, aliases, say)
+        masks = _prepare(images, names, work, aliases)
         groups = _group_by_lens(images, names).values()
         job = {
             "images": str(work / "images"),
@@ -175,13 +175,15 @@ def find_poses(folder: Path, say: Callable[[str], None] = lambda line: None, is_
         }
         (work / "models").mkdir()
         models, matches = _run(job, work, say)
-        faults = _list_faults(matches)
+        faults = _list_faults(matches) + ([] if models else _describe_mirrored(images, names, names))
         if not models:
             found = f"{len(names)} photographs without enough overlap"
             raise refusal(folder, found, "photographs that show the same parts from several places", "; ".join(faults) or AGAIN)
         for line in faults:
             say(line)
         poses = _keep(folder, sorted(models, key=lambda model: -len(model["names"])), names, matches)
+        for line in _describe_mirrored(images, names, poses.unposed):
+            say(line)
     except MivolError:
         shutil.rmtree(work, ignore_errors=True)
         raise
@@ -269,7 +271,7 @@ def _leave_out_copies(folder: Path, images: Path, names: list[str], say: Callabl
     return kept
 
 
-def _prepare(images: Path, names: list[str], work: Path, aliases: Mapping[str, str], say: Callable[[str], None]) -> int:
+def _prepare(images: Path, names: list[str], work: Path, aliases: Mapping[str, str]) -> int:
     """Make folders of photographs and masks for COLMAP: links, and copies of turned or converted photographs.
 
     Returns:
@@ -280,12 +282,6 @@ def _prepare(images: Path, names: list[str], work: Path, aliases: Mapping[str, s
     """
     headers, masks = {name: read_photo_header(images / name) for name in names}, 0
     turns = any(header.orientation > 4 for header in headers.values())
-    mirrored = [name for name in names if headers[name].orientation in MIRRORED]
-    if 0 < len(mirrored) < len(names):
-        say(
-            f"{len(mirrored)} of {len(names)} photographs ({mirrored[0]}, ...) are mirrored by their EXIF orientation, and "
-            "mirror images do not match the others: take them again with the back camera, or remove a wrong tag"
-        )
     for name in names:
         copy = work / "images" / aliases.get(name, name)
         orientation = headers[name].orientation if turns else 1
@@ -295,6 +291,18 @@ def _prepare(images: Path, names: list[str], work: Path, aliases: Mapping[str, s
             read_mask(mask)  # refuses a damaged mask, which COLMAP would ignore
             _prepare_file(mask, work / "masks" / f"{aliases.get(name, name)}.png", orientation)
     return masks
+
+
+def _describe_mirrored(images: Path, names: list[str], unposed: Sequence[str]) -> list[str]:
+    """A sentence on photographs without a pose that EXIF mirrors, unlike others."""
+    mirrored = {name for name in names if read_photo_header(images / name).orientation in MIRRORED}
+    lost = [name for name in unposed if name in mirrored]
+    if not lost or len(mirrored) == len(names):
+        return []
+    return [
+        f"{len(lost)} of {len(names)} photographs ({lost[0]}, ...) are mirrored by their EXIF orientation and found no pose, "
+        "because mirror images do not match the others: take them again with the back camera, or remove a wrong tag"
+    ]
 
 
 def _prepare_file(file: Path, copy: Path, orientation: int) -> None:
