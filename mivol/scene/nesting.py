@@ -83,6 +83,10 @@ class OrientedBox:
         away = (inside - np.clip(inside, 0, 1)) * lengths
         return float(np.linalg.norm(away) / lengths.max())
 
+    def contains(self, other: OrientedBox) -> bool:
+        """Whether another box lies inside, to ``FACE_TOLERANCE``."""
+        return all(self.distance(corner) <= FACE_TOLERANCE for corner in other.corners)
+
     @classmethod
     def from_box(cls, box: Box) -> OrientedBox:
         """Convert a parallelepiped."""

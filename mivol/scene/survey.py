@@ -196,9 +196,8 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     if fault is not None:
         raise MivolError(fault)
     around = find_outside_media([o for o in traverse(scene).hierarchy if isinstance(o, mi.Medium)], boundaries)
-    exteriors = {s.exterior_medium().ptr for s in shapes if s.is_medium_transition() and s.exterior_medium() is not None}
-    # A medium that also surrounds a shape has no known end.
-    boundaries = [replace(b, around=None) if b.medium.ptr in exteriors else b for b in boundaries]
+    endless = _find_endless_media(boundaries, shapes, boxes)
+    boundaries = [replace(b, around=None) if b.medium.ptr in endless else b for b in boundaries]
     boundaries = [part for boundary in boundaries for part in _split_levels(boundary)] + around
     solid = [*surfaces, *(s for s in edges if _is_bare(s))]
     # A GPU traces rays in hardware.
@@ -223,6 +222,17 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
         surface_boxes=pieces if 0 < len(pieces) <= MAX_SURFACE_BOXES else None,
     )
     return SceneSurvey(tuple(boundaries), facts, marks, scene_diagonal(scene), tracer)
+
+
+def _find_endless_media(boundaries: Sequence[Boundary], shapes: Sequence[mi.Shape], boxes: dict[int, OrientedBox]) -> set[int]:
+    """Pointers of the media that also surround a shape outside of the shapes they fill: such a medium has no known end."""
+    endless = set()
+    for shape in shapes:
+        if shape.is_medium_transition() and shape.exterior_medium() is not None:
+            medium = shape.exterior_medium().ptr
+            if not any(b.medium.ptr == medium and b.around.contains(boxes[shape.ptr]) for b in boundaries):
+                endless.add(medium)
+    return endless
 
 
 def _read_placement(shape: mi.Shape) -> object:

@@ -538,7 +538,7 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
         # The last segment of a path finds emitters by chance only.
         aims = may_scatter & (path.depth + 2 < limit)
         p = mi.Point3f(event.vertex(estimators.media).interaction.p)
-        samples.aimed = estimators.near.aim(p, sampler.next_1d(aims), aims)
+        samples.aimed = estimators.near.aim(p, path.beta, sampler.next_1d(aims), aims)
     onward = sample_next_direction(estimators, path.ray, event, samples, may_scatter)
     path.is_opaque |= arrives & ~onward.through
     if splits is not None:
