@@ -95,6 +95,27 @@ def test_frequencies_are_probabilities(along: bool) -> None:
             np.testing.assert_allclose(mine, (np.arange(len(mine)) + 0.5) / len(mine), atol=2 / len(mine) + 1e-3)
 
 
+def test_a_ray_chooses_the_lamp_that_it_passes() -> None:
+    """Half of the choices of a ray go by the integral of 1 / r^2, which rises as 1 / h at a distance h of a lamp."""
+    lights = {f"lamp{k}": point([0.3 * k - 1.2, 0.4 * (k % 3), 0.2], 0.2 if k == 5 else 2.0)[0] for k in range(8)}
+    found, h = emitters_of(lights), np.array([1e-4, 3e-4])
+    rays = mi.Ray3f(mi.Point3f(0.3, -3, 0.2 + mi.Float(h)), mi.Vector3f(0, 1, 0))
+    seen = probabilities(found, found._grid.along_ray(rays, False))
+    # The integral is at most pi / 0.3 for each of the seven others, ten times as strong; their places change that by less than 4.
+    assert (seen[5] > 0.5 * (1 - 4 * 70 * h / 0.3)).all() and (seen[5] < 0.6).all()
+    np.testing.assert_allclose(seen.sum(0), 1, rtol=ROUNDING)
+
+
+def test_cells_are_fine_around_lamps_in_a_wide_box() -> None:
+    """In a fog a hundred times as wide as the lamps are apart, a vertex beside one of them chooses it."""
+    wide = {"type": "scene", "fog": fog(0.3, to_world=np.diag([200.0, 200, 200, 1]))[0]}
+    pair = {"a": point([0, 0, 0])[0], "b": point([2, 0, 0])[0]}
+    found = SceneEmitters(mi.load_dict(wide | pair))
+    # At a tenth of their distance one gives 81 times as much as the other, in a cell 0.1 away still 16 times as much.
+    seen = probabilities(found, found._grid.at_point(mi.Point3f([0.2, 1.8], 0, 0)))
+    assert (seen.max(axis=0) > 0.8).all() and seen.argmax(axis=0)[0] != seen.argmax(axis=0)[1]
+
+
 def test_numbers_of_emitters_and_of_others() -> None:
     """An emitter has its number, a constant sky and no emitter have none."""
     found = emitters_of({**lamps(4), "sky": {"type": "constant"}})

@@ -10,7 +10,9 @@ f_k / P(k) has the least variance if P(k) is in proportion to the root of the me
 A choice by the light in all cells has a share, in case the points of a cell miss an emitter. An even choice has a smaller
 share, so an emitter of radiance 0 has derivatives.
 
-A vertex chooses by its cell. A ray chooses by the sum over points along the ray.
+A vertex chooses by its cell. A ray chooses by the sum over points along the ray. The light scattered along a ray that passes an
+emitter at a distance h much smaller than a cell rises as 1 / h, so half of the choices of a ray go by the integral of
+1 / r^2 along it, if the emitters are few.
 
 Conventions. The grid covers a box and, with wider cells, the rest of space: a coordinate x of the box, in [-1, 1], keeps its
 place, and |x| > 1 moves to 1 + (1 - 1 / |x|) / 3, which is less than ``EDGE``. Cells have equal edges in these coordinates.
@@ -20,6 +22,7 @@ References: Veach 1997, Sec. 2.2 (importance sampling); Roberts 2018 (additive r
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -52,6 +55,12 @@ MEAN_SHARE, EVEN_SHARE = 0.1, 0.01
 RAY_POINTS = 16
 """Points along a ray."""
 
+MAX_PASSED = 16
+"""Most emitters for which a ray computes the integral of 1 / r^2 [1]."""
+
+PASSED_SHARE = 0.5
+"""Share of the choices of a ray by this integral [1]."""
+
 EDGE = 4 / 3
 """Largest coordinate of a cell [1], at infinity."""
 
@@ -68,6 +77,8 @@ class EmitterGrid:
         count: number of emitters.
         cells: number of cells along each axis.
         centre, half: centre and half edges of the box [length].
+        everywhere: share of each emitter in the light of all cells [1]; None with one emitter.
+        balls: centre and radius of each emitter [length], if a ray weighs them by the integral of 1 / r^2; else empty.
     """
 
     cumulative: mi.Float
@@ -75,6 +86,8 @@ class EmitterGrid:
     cells: int
     centre: mi.Point3f
     half: mi.Vector3f
+    everywhere: mi.Float | None = None
+    balls: Sequence[Sequence[mi.Float]] = ()
 
     def at_point(self, p: mi.Point3f) -> EmitterDistribution:
         """The distribution at a point."""
@@ -93,7 +106,16 @@ class EmitterGrid:
         start = mi.Float(0) if from_origin else near
         o, d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
         points = [o + d * dr.lerp(start, far, (k + 0.5) / RAY_POINTS) for k in range(RAY_POINTS)]
-        return EmitterDistribution(self, [self._row(p) for p in points])
+        passed = [self._weigh_passed(k, o + d * start, d) for k in range(len(self.balls))]
+        return EmitterDistribution(self, [self._row(p) for p in points], passed)
+
+    def _weigh_passed(self, number: int, p: mi.Point3f, d: mi.Vector3f) -> mi.Float:
+        """The integral of 1 / r^2 from a point on along a ray, times the share of an emitter in all light."""
+        *centre, radius = self.balls[number]
+        away = mi.Point3f(*centre) - p
+        h = dr.norm(dr.cross(away, d))
+        angle = dr.pi - dr.atan2(h, dr.dot(away, d))
+        return dr.gather(mi.Float, self.everywhere, number) * angle / dr.maximum(dr.maximum(h, radius), MIN_TOTAL)
 
     def total(self, row: mi.UInt32) -> mi.Float:
         """The last sum of a cell, by the index of its first sum."""
@@ -131,10 +153,12 @@ class EmitterDistribution:
     Attributes:
         grid: the grid.
         rows: index of the first sum of each cell.
+        passed: weights of the emitters by the integral of 1 / r^2 along a ray; empty if it does not count.
     """
 
     grid: EmitterGrid
     rows: list[mi.UInt32]
+    passed: Sequence[mi.Float] = ()
 
     def sample(self, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         """Choose an emitter by a uniform random number in [0, 1).
@@ -144,6 +168,21 @@ class EmitterDistribution:
         """
         if self.grid.count == 1:
             return mi.UInt32(0), u
+        if not self.passed:
+            return self._sample_cells(u)
+        by_passed = u < PASSED_SHARE
+        u = dr.select(by_passed, u / PASSED_SHARE, (u - PASSED_SHARE) / (1 - PASSED_SHARE))
+        in_cells, rest_in_cells = self._sample_cells(u)
+        # -- An emitter passed by the ray --------------------------------------------------------------------------------
+        left, number, own = u * sum(self.passed), mi.UInt32(0), self.passed[0]
+        for k, weight in enumerate(self.passed[1:]):
+            is_behind = (number == k) & (left >= own)
+            left, number, own = dr.select(is_behind, left - own, left), dr.select(is_behind, k + 1, number), dr.select(is_behind, weight, own)
+        rest = dr.clip(left / dr.select(own > 0, own, 1), 0, dr.one_minus_epsilon(mi.Float))
+        return dr.select(by_passed, number, in_cells), dr.select(by_passed, rest, rest_in_cells)
+
+    def _sample_cells(self, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        """Choose an emitter as :meth:`sample` does, by the cells alone."""
         # -- A cell ------------------------------------------------------------------------------------------------------
         totals = [self.grid.total(row) for row in self.rows]
         x, below, before, row = u * sum(totals[1:], totals[0]), totals[0], mi.Float(0), self.rows[0]
@@ -169,23 +208,26 @@ class EmitterDistribution:
             low, high = self.grid.bounds(row, at)
             weight += high - low
             total += self.grid.total(row)
-        return dr.select(there & (total > 0), weight / dr.select(total > 0, total, 1), 0)
+        share = weight / dr.select(total > 0, total, 1)
+        if self.passed:
+            passed = sum(dr.select(number == k, w, 0) for k, w in enumerate(self.passed))
+            share = dr.lerp(share, passed / sum(self.passed), PASSED_SHARE)
+        return dr.select(there & (total > 0), share, 0)
 
 
-def tabulate_emitters(emitters: mi.EmitterPtr, box: mi.ScalarBoundingBox3f, is_near: bool) -> EmitterGrid:
+def tabulate_emitters(
+    emitters: mi.EmitterPtr, centre: mi.Point3f, half: mi.Vector3f, balls: Sequence[Sequence[mi.Float] | None]
+) -> EmitterGrid:
     """Estimate the light of emitters in the cells of a grid.
 
     Args:
         emitters: the emitters.
-        box: box of the media.
-        is_near: some emitter has a finite distance; otherwise one cell is enough.
+        centre, half: centre and half edges of the box [length].
+        balls: centre and radius of each emitter [length], None at infinity. If all are at infinity, one cell is enough.
 
     Cost: at most ``MAX_SAMPLES`` emitter samples.
     """
-    count = dr.width(emitters)
-    half = [max(float(v) / 2, 1e-6) for v in box.extents()]
-    centre = mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in box.center()))
-    half = mi.Vector3f(*(dr.opaque(mi.Float, v) for v in half))
+    count, is_near = dr.width(emitters), any(b is not None for b in balls)
     if count == 1:
         return EmitterGrid(mi.Float(1), 1, 1, centre, half)
     cells = max(1, min(MAX_CELLS, int((MAX_SAMPLES / (count * CELL_POINTS)) ** (1 / 3)))) if is_near else 1
@@ -209,12 +251,14 @@ def tabulate_emitters(emitters: mi.EmitterPtr, box: mi.ScalarBoundingBox3f, is_n
     dr.scatter_add(everywhere, weight, entry % count)
     total = dr.gather(mi.Float, dr.block_sum(weight, count), entry // count)
     even = scale / dr.maximum(dr.gather(mi.Float, dr.block_sum(scale, count), entry // count), MIN_TOTAL)
-    mean = dr.gather(mi.Float, everywhere / dr.maximum(dr.sum(everywhere), MIN_TOTAL), entry % count)
+    everywhere /= dr.maximum(dr.sum(everywhere), MIN_TOTAL)
+    mean = dr.gather(mi.Float, everywhere, entry % count)
     other = dr.maximum(total, MIN_TOTAL) * (MEAN_SHARE * mean + EVEN_SHARE * even)
     weight = dr.fma(1 - MEAN_SHARE - EVEN_SHARE, weight, other)
     cumulative = dr.block_prefix_reduce(dr.ReduceOp.Add, weight, count, exclusive=False)
-    dr.eval(cumulative)
-    return EmitterGrid(cumulative, count, cells, centre, half)
+    dr.eval(cumulative, everywhere)
+    passed = balls if count <= MAX_PASSED and None not in balls else ()
+    return EmitterGrid(cumulative, count, cells, centre, half, everywhere, passed)
 
 
 def _draw_place(cell: mi.UInt32, point: mi.Float, cells: int) -> mi.Vector3f:

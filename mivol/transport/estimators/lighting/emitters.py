@@ -45,6 +45,10 @@ PARALLEL_AREA = "DirectionalArea"
 """Mitsuba's class of a surface that shines along its normal only. No path finds its light, and ``eval_direction`` raises."""
 
 
+MIN_HALF_EDGE = 1e-6
+"""Smallest half edge of the box of a grid of emitters [length]: shapes may be flat."""
+
+
 class SceneEmitters:
     """The emitters of a scene, and the samples by which their light is found.
 
@@ -80,7 +84,8 @@ class SceneEmitters:
         self.are_evaluated = all(e.class_name() != PARALLEL_AREA for e in scene.emitters())
         if self.sampled:
             self._table = _EmitterTable.of(scene, self.sampled, self._balls)
-            self._grid = tabulate_emitters(self._table.pointers, find_lit_box(scene), self.is_near)
+            box = self._table.find_varied_box(find_lit_box(scene))
+            self._grid = tabulate_emitters(self._table.pointers, *box, self._balls)
 
     def number_of(self, emitter: mi.EmitterPtr) -> mi.UInt32:
         """The index of an emitter among those ``sampled``."""
@@ -234,6 +239,23 @@ class _EmitterTable:
         """Centre and radius of an emitter [length], and whether its distance is finite."""
         x, y, z, r, finite = (dr.gather(mi.Float, column, number) for column in self.balls)
         return x, y, z, r, finite > 0
+
+    def find_varied_box(self, lit: mi.ScalarBoundingBox3f) -> tuple[mi.Point3f, mi.Vector3f]:
+        """Centre and half edges of the part of a box in which the shares of emitters vary [length]: around those with a position.
+
+        Far away from all of them, shares are even. The part reaches beyond the emitters by half of their largest distance along an
+        axis. Without two emitters that have a position, or if all lie far outside, it is the whole box.
+        """
+        low, high = (mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in corner)) for corner in (lit.min, lit.max))
+        if len(self.emitters) > 1:
+            *axes, r, finite = self.balls
+            below = mi.Point3f(*(dr.min(dr.select(finite > 0, x - r, dr.inf)) for x in axes))
+            above = mi.Point3f(*(dr.max(dr.select(finite > 0, x + r, -dr.inf)) for x in axes))
+            reach = dr.max(above - below) / 2
+            cut_low, cut_high = dr.maximum(low, below - reach), dr.minimum(high, above + reach)
+            is_part = (dr.sum(finite) > 1) & dr.all(cut_low < cut_high)
+            low, high = dr.select(is_part, cut_low, low), dr.select(is_part, cut_high, high)
+        return (low + high) / 2, dr.maximum(mi.Vector3f(high - low) / 2, MIN_HALF_EDGE)
 
 
 def join_arrays(values: list[mi.Float] | list[mi.UInt32]) -> mi.Float | mi.UInt32:
