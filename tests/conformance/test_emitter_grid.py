@@ -101,7 +101,7 @@ def test_a_ray_chooses_the_lamp_that_it_passes() -> None:
     found, h = emitters_of(lights), np.array([1e-4, 3e-4])
     rays = mi.Ray3f(mi.Point3f(0.3, -3, 0.2 + mi.Float(h)), mi.Vector3f(0, 1, 0))
     seen = probabilities(found, found._grid.along_ray(rays, False))
-    # The integral is at most pi / 0.3 for each of the seven others, ten times as strong; their places change that by less than 4.
+    # The integral is at most pi / 0.3 for each of seven others, ten times as strong; their places change it less than 4 times.
     assert (seen[5] > 0.5 * (1 - 4 * 70 * h / 0.3)).all() and (seen[5] < 0.6).all()
     np.testing.assert_allclose(seen.sum(0), 1, rtol=ROUNDING)
 

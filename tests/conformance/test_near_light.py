@@ -290,8 +290,8 @@ def test_each_lamp_inside_has_a_share_of_all_directions(monkeypatch):
 def test_paths_of_a_thick_medium_keep_their_light():
     """In a white ball around a lamp, most pixels of 256 samples show more than a hundredth of the light that leaves the ball.
 
-    The ball has an optical radius of 30 and a mean cosine of 0.8. The mean image is I / pi = 1.3 (the lamp's power over the ball's
-    surface). With shares at every vertex a path of n scatterings keeps its light with a probability of 0.6^n, and the median
+    The ball has an optical radius of 30 and a mean cosine of 0.8. The mean image is I / pi = 1.3, the lamp's power over the
+    surface. With shares at every vertex a path of n scatterings keeps its light with a probability of 0.6^n, and the median
     pixel showed 9e-4. Now it shows 0.05.
     """
     fog = medium("homogeneous", 30.0, 1.0, phase={"type": "hg", "g": 0.8})
@@ -320,11 +320,10 @@ def test_the_plan_knows_where_emitters_are():
     assert _draws({"smoke": grid, "lamp": point([0.2, 0, 0])[0]}, max_depth=2) == (False, [])
     assert _draws({"smoke": grid, "lamp": point([0.2, 0, 0])[0]}, near_light="vertices")[0] is False
     # A medium around another medium ends at its own shape, but a medium around a far shape may be anywhere.
-    outer, null = {"type": "homogeneous", "sigma_t": 1.0, "id": "outer"}, {"type": "null"}
-    skin = {"type": "sphere", "bsdf": null, "interior": {"type": "ref", "id": "outer"}}
+    outer = {"type": "homogeneous", "sigma_t": 1.0, "id": "outer"}
+    skin = ball_of({"type": "ref", "id": "outer"}, [0, 0, 0], 1)
     for x, is_inside in ((0.2, False), (9.0, True)):
-        flesh = {"type": "sphere", "radius": 0.5, "center": [x, 0, 0], "bsdf": null, "interior": medium("homogeneous", 2.0, 0.5)}
-        flesh["exterior"] = {"type": "ref", "id": "outer"}
+        flesh = ball_of(medium("homogeneous", 2.0, 0.5), [x, 0, 0], 0.5) | {"exterior": {"type": "ref", "id": "outer"}}
         _, (why,) = _draws({"outer": outer, "skin": skin, "flesh": flesh, "lamp": point([0, 0, 9.0])[0]})
         assert ("inside a medium" in why) == is_inside
     assert _draws({"smoke": grid, "lamp": point([0, 0, 9.0])[0]}, near_light="segments")[0] is True

@@ -177,7 +177,8 @@ class EmitterDistribution:
         left, number, own = u * sum(self.passed), mi.UInt32(0), self.passed[0]
         for k, weight in enumerate(self.passed[1:]):
             is_behind = (number == k) & (left >= own)
-            left, number, own = dr.select(is_behind, left - own, left), dr.select(is_behind, k + 1, number), dr.select(is_behind, weight, own)
+            left = dr.select(is_behind, left - own, left)
+            number, own = dr.select(is_behind, k + 1, number), dr.select(is_behind, weight, own)
         rest = dr.clip(left / dr.select(own > 0, own, 1), 0, dr.one_minus_epsilon(mi.Float))
         return dr.select(by_passed, number, in_cells), dr.select(by_passed, rest, rest_in_cells)
 

@@ -44,7 +44,6 @@ UNIFORM_EMITTER = "ConstantBackgroundEmitter"
 PARALLEL_AREA = "DirectionalArea"
 """Mitsuba's class of a surface that shines along its normal only. No path finds its light, and ``eval_direction`` raises."""
 
-
 MIN_HALF_EDGE = 1e-6
 """Smallest half edge of the box of a grid of emitters [length]: shapes may be flat."""
 
@@ -241,10 +240,10 @@ class _EmitterTable:
         return x, y, z, r, finite > 0
 
     def find_varied_box(self, lit: mi.ScalarBoundingBox3f) -> tuple[mi.Point3f, mi.Vector3f]:
-        """Centre and half edges of the part of a box in which the shares of emitters vary [length]: around those with a position.
+        """Centre and half edges of the part of a box in which the shares of emitters vary [length]: near the emitters.
 
-        Far away from all of them, shares are even. The part reaches beyond the emitters by half of their largest distance along an
-        axis. Without two emitters that have a position, or if all lie far outside, it is the whole box.
+        Far away from all emitters with a position, shares are even. The part reaches beyond them by half of their largest
+        distance along an axis. Without two such emitters, or if all lie far outside, it is the whole box.
         """
         low, high = (mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in corner)) for corner in (lit.min, lit.max))
         if len(self.emitters) > 1:

@@ -61,10 +61,10 @@ MAX_AIMED_SHARE = 0.4
 the variance. (Variance with a lamp in smoke, depth 8, and shares of 0, 1/4, 0.4 and 1/2: 1.9e-2, 4.3e-3, 3.7e-3, 3.1e-3.)"""
 
 MAX_AIMED_THROUGHPUT = 2.0
-"""Throughput to which the aimed share of directions may raise the other directions [1]. Without a bound a path in a dense medium
-gains a factor of up to 1 / (1 - 0.4) at each vertex, or ends in a direction of nearly no light: after 50 scatterings almost no
-path has any light. (Variance with a lamp in a ball, bounds of 2, 4, 8 and none: 0.134, 0.132, 0.131 and 0.131 at an optical
-radius of 4; 8.7, 9.1, 26 and 26 at 12. At 60, with a mean cosine of 0.9, images without a bound show no light.)"""
+"""Throughput to which the aimed share of directions may raise the other directions [1]. Without a bound, a path in a dense
+medium gains a factor of up to 1 / (1 - 0.4) at each vertex, or ends in a direction of nearly no light. After 50 scatterings
+almost no path has any light left. (Variance with a lamp in a ball, with bounds of 2, 4, 8 and none: 0.134, 0.132, 0.131 and
+0.131 at an optical radius of 4; 8.7, 9.1, 26 and 26 at 12. At 60, with a mean cosine of 0.9, images are black without one.)"""
 
 MAX_MIXED = 16
 """Largest number of emitters inside media whose directions are mixed: each costs its density at every vertex."""
