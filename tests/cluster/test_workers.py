@@ -451,7 +451,7 @@ def test_time_of_units_that_stream_by_hand() -> None:
     network, views = Network(0.1, 10e6), Workload("a", 12, 1.0, 1e6, streams=True)
     assert [round(step_seconds(views, network, workers), 6) for workers in (1, 4, 6, 12)] == [12.0, 3.0, 2.4, 2.4]
     assert say_limit(views, network) == "6 workers: the owner receives images one after another"
-    assert say_limit(Workload("b", 3, 1.0, 0.0, streams=True), network) == "3 workers: no more units"
+    assert say_limit(Workload("b", 3, 1.0, 0.0, streams=True), network) == "3 workers: no more pieces of work"
 
 
 def test_dask_is_imported_with_the_switch_only() -> None:

@@ -69,8 +69,8 @@ def test_gaussians_have_gains_if_exposures_differ(variant_rgb: str, tmp_path: Pa
     start = start_gaussians(chosen, load_photos(folder), make_gaussian_plan(chosen))
     assert start.plan.exposure == has_gains
     reasons = [line.reason for line in start.lines if "gains" in line.choice]
-    facts = "common points differ in brightness by 26% between photographs, and by 51% from what the nearest photographs"
-    assert reasons == [f"{facts} predict"] * has_gains
+    facts = "points differ in brightness by 26% between photographs, and by 51% from the prediction by the nearest photographs"
+    assert reasons == [facts] * has_gains
 
 
 @pytest.mark.parametrize(("turns", "kept"), [(-1.0, True), (1.0, False)], ids=["differ", "predicted"])

@@ -160,6 +160,7 @@ def test_facts_with_the_same_key_have_the_same_decisions(monkeypatch: pytest.Mon
             "near_gain": 2.0,
             "surfaces": (),
             "has_lamps": False,
+            "has_glass": False,
         }
         asked = needs(facts, boundaries=[SimpleNamespace(box="a box", hole=None, around=None)], are_emitters_far=False,
                       nearness=0.2, is_sealed=False, branch_noise=None, are_samples_independent=False,
