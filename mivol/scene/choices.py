@@ -512,6 +512,8 @@ def is_mirror_noise_open(needs: Needs, settings: Settings, segment: str) -> bool
     """Whether a preview decides if the light that glass mirrors to the camera gets camera rays of its own."""
     if segment != "free_flight" or settings.scatterings < 1 or not needs.has_glass:
         return False
+    if any(m.emits and m.has_own_walk for m in needs.media):
+        return False  # the rays of mirrors would count the light of Gaussians before the glass once more
     return needs.are_samples_independent and needs.is_colour_film and needs.film_samples >= MIN_LAMP_SAMPLES
 
 

@@ -278,6 +278,15 @@ def test_nothing_else_counts_as_glass(variant_rgb: str) -> None:
     assert not mirror_lines(aquarium({"type": "mask", "opacity": 0.3, "bsdf": {"type": "conductor"}}, res=96))
 
 
+@pytest.mark.parametrize("of_gaussians", [False, True])
+def test_gaussians_before_glass_shine_once(of_gaussians: bool) -> None:
+    """Rays of mirrors leave out what media emit before the glass, but not the light of Gaussians, which is summed."""
+    light = SimpleNamespace(emits=True, has_own_walk=of_gaussians)
+    film = {"are_samples_independent": True, "is_colour_film": True, "film_samples": choices.MIN_LAMP_SAMPLES}
+    facts = SimpleNamespace(has_glass=True, media=[light], **film)
+    assert choices.is_mirror_noise_open(facts, Settings(max_depth=4), "free_flight") != of_gaussians
+
+
 def test_the_mirror_rays_follow_noise_and_cost(monkeypatch: pytest.MonkeyPatch) -> None:
     """(v k^-3/2 + 1 / 64)(1 + k / 128) for a variance v of a ray and 1 of other light, over k of 4, 8, 16, 32, 64.
 

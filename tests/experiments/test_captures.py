@@ -119,7 +119,7 @@ def test_a_folder_of_photographs_becomes_a_page(tmp_path: Path) -> None:
     # A fit of two numbers a channel is nearer to the photograph than the view itself, but for 8 bits.
     assert all(float(row[3]) > float(row[1]) - 0.1 for row in table["rows"])
     page = (run / "report.html").read_text()
-    assert "view_08.png" in page and "colours fitted" in page
+    assert "view_08.png" in page and "after colour correction" in page
     assert record["judged"] == "2 views at 32 x 24 pixels" and "2 views at 32 x 24 pixels; " in page.replace("\u00a0", " ")
     assert page.count("|Render − reference|") >= 2 and "the worst of 2: PSNR" in page
     field = read_field(run / "field.npz")
