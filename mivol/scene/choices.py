@@ -502,10 +502,8 @@ def choose_emission_rays(needs: Needs, settings: Settings, segment: str) -> tupl
     """
     if not is_emission_noise_open(needs, settings, segment) or needs.emission_noise is None:
         return 0, []
-    count, why = _count_own_rays(needs.emission_noise, needs.spp, EMISSION_COST)
-    if count == 0:
-        return 0, [Choice("emission in view", "found by paths", why)]
-    return count, [Choice("emission in view", f"summed along {count} camera rays of its own a pixel, in images", why)]
+    words = "emission in view", "found by paths", "summed"
+    return _choose_own_rays(needs.emission_noise, needs.spp, EMISSION_COST, *words)
 
 
 def is_mirror_noise_open(needs: Needs, settings: Settings, segment: str) -> bool:
@@ -524,19 +522,22 @@ def choose_mirror_rays(needs: Needs, settings: Settings, segment: str) -> tuple[
     """
     if not is_mirror_noise_open(needs, settings, segment) or needs.mirror_noise is None:
         return 0, []
-    count, why = _count_own_rays(needs.mirror_noise, needs.spp, MIRROR_COST)
-    if count == 0:
-        return 0, [Choice("light mirrored by glass", "found by chance", why)]
-    return count, [Choice("light mirrored by glass", f"found along {count} camera rays of its own a pixel, in images", why)]
+    words = "light mirrored by glass", "found by chance", "found"
+    return _choose_own_rays(needs.mirror_noise, needs.spp, MIRROR_COST, *words)
 
 
-def _count_own_rays(noise: OwnRaysNoise, spp: int, cost: float) -> tuple[int, str]:
-    """The number of own camera rays of a pixel with the least variance x time, 0 for none, and the reason.
+def _choose_own_rays(
+    noise: OwnRaysNoise, spp: int, cost: float, subject: str, without: str, verb: str
+) -> tuple[int, list[Choice]]:
+    """Choose the number of own camera rays of a pixel with the least variance x time; 0 for none.
 
     Args:
         noise: measured variances.
         spp: samples per pixel.
         cost: time of an own ray over the time of a path [1].
+        subject: the light.
+        without: how the light is found without own rays.
+        verb: what own rays do with the light.
     """
     counts = {max(1, round(share * spp)) for share in OWN_RAYS}
     work = {k: (noise.rays * k**-1.5 + noise.rest / spp) * (1 + cost * k / spp) for k in sorted(counts)}
@@ -544,7 +545,10 @@ def _count_own_rays(noise: OwnRaysNoise, spp: int, cost: float) -> tuple[int, st
     gain = noise.paths / spp / work[best] if work[best] > 0 else 0.0
     ratio = noise.paths / noise.rest if noise.rest > 0 else math.inf
     share = f"with it, paths have {ratio:.2g} times the noise of all other light in a preview"
-    return (0, share) if gain < MIN_OWN_GAIN else (best, f"{share}: the same error {gain:.2g} times as fast")
+    if gain < MIN_OWN_GAIN:
+        return 0, [Choice(subject, without, share)]
+    why = f"{share}: the same error {gain:.2g} times as fast"
+    return best, [Choice(subject, f"{verb} along {best} camera rays of its own a pixel, in images", why)]
 
 
 def _explain_missing_lamp_rays(needs: Needs, settings: Settings) -> str | None:

@@ -83,7 +83,8 @@ class SceneEmitters:
         self.are_evaluated = all(e.class_name() != PARALLEL_AREA for e in scene.emitters())
         if self.sampled:
             self._table = _EmitterTable.of(scene, self.sampled, self._balls)
-            box = self._table.find_varied_box(find_lit_box(scene))
+            several = sum(ball is not None for ball in self._balls) > 1
+            box = self._table.find_varied_box(find_lit_box(scene), several)
             self._grid = tabulate_emitters(self._table.pointers, *box, self._balls)
 
     def number_of(self, emitter: mi.EmitterPtr) -> mi.UInt32:
@@ -239,20 +240,20 @@ class _EmitterTable:
         x, y, z, r, finite = (dr.gather(mi.Float, column, number) for column in self.balls)
         return x, y, z, r, finite > 0
 
-    def find_varied_box(self, lit: mi.ScalarBoundingBox3f) -> tuple[mi.Point3f, mi.Vector3f]:
+    def find_varied_box(self, lit: mi.ScalarBoundingBox3f, several: bool) -> tuple[mi.Point3f, mi.Vector3f]:
         """Centre and half edges of the part of a box in which the shares of emitters vary [length]: near the emitters.
 
         Far away from all emitters with a position, shares are even. The part reaches beyond them by half of their largest
-        distance along an axis. Without two such emitters, or if all lie far outside, it is the whole box.
+        distance along an axis. Without ``several`` such emitters, or if all lie far outside, it is the whole box.
         """
         low, high = (mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in corner)) for corner in (lit.min, lit.max))
-        if len(self.emitters) > 1:
+        if several:
             *axes, r, finite = self.balls
             below = mi.Point3f(*(dr.min(dr.select(finite > 0, x - r, dr.inf)) for x in axes))
             above = mi.Point3f(*(dr.max(dr.select(finite > 0, x + r, -dr.inf)) for x in axes))
             reach = dr.max(above - below) / 2
             cut_low, cut_high = dr.maximum(low, below - reach), dr.minimum(high, above + reach)
-            is_part = (dr.sum(finite) > 1) & dr.all(cut_low < cut_high)
+            is_part = dr.all(cut_low < cut_high)
             low, high = dr.select(is_part, cut_low, low), dr.select(is_part, cut_high, high)
         return (low + high) / 2, dr.maximum(mi.Vector3f(high - low) / 2, MIN_HALF_EDGE)
 
