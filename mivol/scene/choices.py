@@ -326,6 +326,9 @@ def choose_side_flights(needs: Needs, settings: Settings, segment: str) -> tuple
     """Choose the mean cosine of the lobe for side flights; None for no side flights."""
     if segment != "free_flight" or settings.scatterings < 2 or not needs.are_emitters_far or needs.is_sealed:
         return None, []
+    if needs.endless_media:
+        # In these, the light from infinity that Mitsuba lets through depends on the technique and the point.
+        return None, []
     cosine = max((m.mean_cosine for m in needs.media if m.mean_cosine is not None), default=0.0)
     if cosine < MIN_SIDE_FLIGHT_COSINE:
         return None, []

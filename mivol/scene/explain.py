@@ -17,7 +17,7 @@ from mivol.cite import list_citations
 from mivol.errors import MivolError
 from mivol.scene.choices import Choice, describe_orders, is_scattering_visible, shares_cells
 from mivol.scene.depth_two import depth_two_error, mean_albedo, scattering_depth
-from mivol.scene.needs import MediumFacts, Needs, find_clipped_view, find_needs, mean_cosine
+from mivol.scene.needs import MediumFacts, Needs, find_clipped_view, find_needs, find_undefined_light, mean_cosine
 from mivol.scene.nesting import shape_bounds
 from mivol.scene.plan import Plan, build_media, make_plan
 from mivol.scene.previews import (
@@ -99,7 +99,8 @@ def explain_scene(
         needs = find_needs(scene, eye, survey, reads_emission=settings.may_draw_emission)
     except MivolError as error:
         return Explanation(("facts", *_describe_unread_scene(scene), *_find_warnings(scene)), str(error))
-    unseen = [*(medium.misplacement for medium in needs.media if medium.misplaced), find_clipped_view(needs, eye)]
+    misplaced = (medium.misplacement for medium in needs.media)
+    unseen = [*misplaced, find_clipped_view(needs, eye), find_undefined_light(needs, scene, eye)]
     facts = ("facts", *_describe_facts(needs), *_find_warnings(scene), *(f"  warning   {said}" for said in unseen if said))
     try:
         check_film(eye)

@@ -184,6 +184,42 @@ def warn_of_clipped_view(needs: Needs, sensor: mi.Sensor, survey: SceneSurvey) -
         warnings.warn(f"{said} (this is said once).", MivolWarning, stacklevel=2)
 
 
+def find_undefined_light(needs: Needs, scene: mi.Scene, sensor: mi.Sensor) -> str:
+    """A sentence if extended light from infinity would have to cross a medium without an end; else empty.
+
+    No sentence if surfaces stop all of 256 rays that leave the camera in directions spread over the sphere.
+    """
+    far = [e for e in scene.emitters() if int(e.flags()) & int(mi.EmitterFlags.Infinite) and _is_extended(e)]
+    if not needs.endless_media or not far or _are_rays_stopped(scene, sensor):
+        return ""
+    return (
+        f"the medium {needs.endless_media[0]} has no end, so it is not defined how much light of {far[0].id()} crosses it from "
+        "infinity (volpath takes what emitter samples find, over twice the radius of the scene): put the medium into a shape "
+        "with a null BSDF around the scene and the camera"
+    )
+
+
+def warn_of_undefined_light(needs: Needs, scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey) -> None:
+    """Warn once for each scene and sensor if extended light from infinity would cross a medium without an end."""
+    if ("undefined", sensor.ptr) in survey.warned or is_recording():
+        return
+    survey.warned.add(("undefined", sensor.ptr))
+    if said := find_undefined_light(needs, scene, sensor):
+        warnings.warn(f"{said} (this is said once).", MivolWarning, stacklevel=2)
+
+
+def _is_extended(emitter: mi.Emitter) -> bool:
+    return not int(emitter.flags()) & int(mi.EmitterFlags.Delta)
+
+
+def _are_rays_stopped(scene: mi.Scene, sensor: mi.Sensor) -> bool:
+    """Whether surfaces stop all of 256 rays that leave a camera in directions spread over the sphere."""
+    with dr.suspend_grad():
+        u, v = dr.meshgrid(dr.linspace(mi.Float, 0, 1, 16), dr.linspace(mi.Float, 0.01, 0.99, 16))
+        ray = mi.Ray3f(mi.Point3f(sensor.world_transform().translation()), mi.warp.square_to_uniform_sphere(mi.Point2f(u, v)))
+        return bool(dr.all(scene.ray_test(ray)))
+
+
 def _is_placement(key: str, owner: object) -> bool:
     """Whether a parameter places a shape or a sensor; colours painted on a mesh do not count."""
     return isinstance(owner, mi.Shape | mi.Sensor) and not is_painted(key.rsplit(".", 1)[-1])
@@ -390,6 +426,12 @@ class Needs(ShapeFacts):
     branch_noise: BranchNoise | None = None
     mirror_noise: OwnRaysNoise | None = None
     media_light: MediaLight | None = None
+
+    @property
+    def endless_media(self) -> tuple[str, ...]:
+        """Names of the media without a known end: they fill the space around shapes, and no grid bounds them."""
+        parts = zip(self.boundaries, self.views, strict=True)
+        return tuple(b.name for b, view in parts if b.around is None and not all(p.lattice for p in view.parts))
 
     @property
     def nearness(self) -> float:

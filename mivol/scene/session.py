@@ -30,6 +30,7 @@ from mivol.scene.needs import (
     read_media,
     warn_of_clipped_view,
     warn_of_misplaced_grids,
+    warn_of_undefined_light,
 )
 from mivol.scene.plan import make_plan, plan_key, read_parts, settings_for
 from mivol.scene.previews import measure_noise, warn_of_last_order
@@ -330,6 +331,7 @@ class Session:
         settings = settings_for(self.settings, needs, for_images)
         warn_of_misplaced_grids(needs, survey)
         warn_of_clipped_view(needs, sensor, survey)
+        warn_of_undefined_light(needs, scene, sensor, survey)
         with dr.suspend_grad():
             needs = measure_noise(scene, sensor, needs, survey, settings, for_images)
         plan = make_plan(needs, settings, self.aovs)

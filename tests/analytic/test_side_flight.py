@@ -155,3 +155,15 @@ def test_a_plan_takes_them_where_they_pay(g, emitter, depth, flies):
     if flies:
         # Means of 4096 samples: 1 / 64 of the spread of the cosine, which is below 1.
         assert made.side_flight_cosine == pytest.approx(g, abs=0.02)
+
+
+@pytest.mark.statistical
+def test_a_medium_without_an_end_has_no_side_flights():
+    """Light of a sun crosses twice the radius of the scene in Mitsuba, as seen from each point; a side flight would see it from
+    the point before. (With side flights the image is a third brighter.)"""
+    fog = {**medium("homogeneous", 0.25, 0.9, phase={"type": "hg", "g": 0.6}), "id": "fog"}
+    sun = {"type": "directional", "direction": [1, 0.3, -0.7], "irradiance": SUN}
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(2)}
+    sensor = {**camera([0, -1.8, 1], [0, 1, 0.6], res=16, fov=70), "fog": {"type": "ref", "id": "fog"}}
+    scene = mi.load_dict({"type": "scene", "fog": fog, "sun": sun, "floor": floor, "sensor": sensor})
+    small.assert_same_images(scene, spp=(64, 128), ours=mivol(max_depth=3), stock=small.volpath(max_depth=3))

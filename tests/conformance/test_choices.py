@@ -224,8 +224,9 @@ def test_how_flights_are_drawn(medium: MediumFacts, choice: str) -> None:
 )
 def test_side_flights(cosines: tuple, far: bool, depth: int, segment: str, expected: float | None) -> None:
     """Of peaked phase functions, for emitters at infinity, where light scatters twice."""
-    asked = needs(*(fog(mean_cosine=c) for c in cosines), are_emitters_far=far)
+    asked = needs(*(fog(mean_cosine=c) for c in cosines), are_emitters_far=far, endless_media=())
     found, said = choices.choose_side_flights(asked, Settings(max_depth=depth), segment)
     assert found == expected and len(said) == (expected is not None)
-    asked.is_sealed = True
-    assert choices.choose_side_flights(asked, Settings(max_depth=depth), segment) == (None, [])
+    for never in ({"is_sealed": True}, {"endless_media": ("fog",)}):
+        without = SimpleNamespace(**(vars(asked) | never))
+        assert choices.choose_side_flights(without, Settings(max_depth=depth), segment) == (None, [])

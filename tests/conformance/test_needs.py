@@ -472,3 +472,36 @@ def test_a_camera_that_ends_before_the_media_is_told(far: float) -> None:
     with pytest.warns(RuntimeWarning, match=sentence) if far < 29 else contextlib.nullcontext():
         mi.render(scene, integrator=integrator, spp=1)
     mi.render(scene, integrator=integrator, spp=1)  # warnings are errors in tests: said once
+
+
+UNDEFINED = {  # whether it is said, the light, and what else is in the scene
+    "sky": (True, lambda: {"type": "constant", "id": "sky"}, dict),
+    "panorama": (True, lambda: {"type": "envmap", "id": "sky", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32))}, dict),
+    "sun, as in volpath": (False, lambda: {"type": "directional"}, dict),
+    "lamp": (False, lambda: {"type": "point"}, dict),
+    "behind walls": (
+        False,
+        lambda: {"type": "constant"},
+        lambda: {"room": {"type": "sphere", "radius": 9, "flip_normals": True}},
+    ),
+    "in a shape": (
+        False,
+        lambda: {"type": "constant"},
+        lambda: {"end": {"type": "sphere", "radius": 9, "bsdf": {"type": "null"}, "interior": {"type": "ref", "id": "fog"}}},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", UNDEFINED)
+def test_light_from_infinity_in_a_medium_without_an_end_is_told(case: str) -> None:
+    said, light, parts = UNDEFINED[case]
+    fog = {**medium("homogeneous", 0.2, 0.9), "id": "fog"}
+    sensor = {**camera([0, -1, 0], [0, 0, 0], res=4), "fog": {"type": "ref", "id": "fog"}}
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1])}
+    scene = mi.load_dict({"type": "scene", "fog": fog, "floor": floor, "light": light(), **parts(), "sensor": sensor})
+    sentence = "the medium fog has no end, so it is not defined how much light of sky crosses it from infinity"
+    assert (f"warning   {sentence}" in explain(scene)) == said
+    integrator = mi.load_dict({"type": "mivol", "max_depth": 3})
+    with pytest.warns(RuntimeWarning, match=sentence) if said else contextlib.nullcontext():
+        mi.render(scene, integrator=integrator, spp=1)
+    mi.render(scene, integrator=integrator, spp=1)  # warnings are errors in tests: said once
