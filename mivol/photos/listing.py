@@ -127,12 +127,20 @@ def split_numbers(name: str) -> list[tuple[int, str]]:
     return [(int(part), part) if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]{1,18})", name)]
 
 
-def list_photographs(folder: Path) -> tuple[Path, list[str]]:
+UNREAD = (".tif", ".tiff", ".bmp", ".gif", ".jp2", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+"""Suffixes of images that are not read as photographs. A folder of TIFF files is a scan."""
+
+
+def list_photographs(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> tuple[Path, list[str]]:
     """Return the folder of the images and the sorted names of the photographs in it, with forward slashes.
 
     The images lie in ``images/`` and folders below, or directly in the folder.
+
+    Args:
+        folder: the data set.
+        suffixes: of the files to list.
     """
     images = folder / "images"
     files = images.rglob("*") if images.is_dir() else folder.iterdir() if folder.is_dir() else ()
     images = images if images.is_dir() else folder
-    return images, sorted(f.relative_to(images).as_posix() for f in files if f.suffix.lower() in SUFFIXES and f.is_file())
+    return images, sorted(f.relative_to(images).as_posix() for f in files if f.suffix.lower() in suffixes and f.is_file())

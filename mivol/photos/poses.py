@@ -26,7 +26,7 @@ from mivol.errors import MivolError
 from mivol.files.source import refusal
 from mivol.photos.colmap import find_model
 from mivol.photos.colmap_process import AGAINST
-from mivol.photos.listing import find_mask, list_photographs, name_first, split_numbers
+from mivol.photos.listing import UNREAD, find_mask, list_photographs, name_first, split_numbers
 from mivol.photos.photo_file import is_damaged, read_lens_facts, read_mask, read_photo_header, write_upright
 from mivol.photos.survey import find_format
 from mivol.threads import follow_program
@@ -153,7 +153,7 @@ def find_poses(folder: Path, say: Callable[[str], None] = lambda line: None, is_
         KeyboardInterrupt: Ctrl-C; features and matches stay in ``WORK``, and the next search of the same photographs
             continues with them.
     """
-    images, listed = _check_folder(folder)
+    images, listed = _check_folder(folder, say)
     names = _leave_out_copies(folder, images, _leave_out_damaged(folder, images, listed, say), say)
     names = sorted(names, key=split_numbers)
     work = folder / WORK
@@ -215,8 +215,8 @@ def _begin_work(work: Path, images: Path, names: list[str]) -> None:
     listed.write_text(json.dumps(facts), encoding="utf-8")
 
 
-def _check_folder(folder: Path) -> tuple[Path, list[str]]:
-    """The folder of the images, and the names of the photographs in it."""
+def _check_folder(folder: Path, say: Callable[[str], None]) -> tuple[Path, list[str]]:
+    """The folder of the images, and the names of the photographs in it; says which images are not read."""
     if folder.is_file():
         found = f"a file {folder.suffix or 'without a suffix'}"
         raise refusal(folder, found, "a folder of photographs, or a video", "unpack an archive, and name its folder")
@@ -229,6 +229,8 @@ def _check_folder(folder: Path) -> tuple[Path, list[str]]:
         way_out = f"mivol optimize {folder}, or remove {model} and search again, if there are new photographs"
         raise refusal(folder, f"poses in it already ({kind})", "photographs without poses", way_out)
     images, names = list_photographs(folder)
+    if unread := list_photographs(folder, UNREAD)[1]:
+        say(f"{len(unread)} images are not read as photographs ({name_first(unread)}): save them as PNG or JPEG to use them")
     _check_count(folder, len(names), f"in {images}")
     return images, names
 

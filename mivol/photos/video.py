@@ -83,14 +83,14 @@ def extract_frames(video: Path, rate: float | None = None, say: Callable[[str], 
         way_out = "cut it, or take photographs of the subject out of it"
         raise refusal(video, f"a video of {duration / 60:.0f} minutes", f"at most {LONGEST / 60:.0f}", way_out)
     rate = min(RATE, MOST / max(duration, 1)) if rate is None else rate
-    folder.mkdir(exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".frames-", dir=folder) as place:
+    with tempfile.TemporaryDirectory(prefix=".frames-", dir=folder.parent) as place:
         images = Path(place) / "images"
         images.mkdir()
         kept, pieces = _keep_frames(video, rate, images)
         if kept < 3:
             found = f"{kept} frame{'s' * (kept != 1)} between which the camera moved, of {pieces} pieces"
             raise refusal(video, found, "at least 3", "film while you walk around the subject")
+        folder.mkdir(exist_ok=True)
         images.rename(folder / "images")
     rest = f"{pieces - kept} without motion or parallax are left out"
     say(f"{folder / 'images'}: {kept} sharp frames of {duration:.0f} s; {rest}")

@@ -22,7 +22,7 @@ from mivol.photos import colmap_process, poses, survey_photos
 from mivol.photos.camera import directions
 from mivol.photos.colmap import CAMERA_MODELS, read_colmap
 from mivol.photos.listing import list_photographs
-from mivol.photos.photo_file import ORIENTATION, read_lens_facts, read_photo_header
+from mivol.photos.photo_file import ORIENTATION, is_damaged, read_lens_facts, read_photo_header
 from mivol.report import cameras
 
 
@@ -154,6 +154,39 @@ def test_damaged_photographs_are_left_out_and_named(folder: Path, job: dict) -> 
     shutil.rmtree(folder / "sparse")
     (images / "b.png").write_bytes(b"")
     assert_refused("found 2 photographs without damage, expected at least 3", poses.find_poses, folder)
+
+
+@pytest.mark.parametrize("options", [{}, {"subsampling": 0, "optimize": True}, {"restart_marker_rows": 1}])
+def test_a_foreign_piece_inside_a_jpeg_is_damage(tmp_path: Path, options: dict) -> None:
+    """Sectors of a card that were lost are zeros; Pillow decodes them without a word. What follows the image does not count."""
+    file, rng = tmp_path / "a.jpg", np.random.default_rng(0)
+    coarse = Image.fromarray(rng.integers(0, 256, (80, 100, 3), np.uint8))
+    coarse.resize((400, 320), Image.Resampling.BICUBIC).save(file, quality=90, **options)
+    whole = file.read_bytes()
+    for sound in (whole, whole + bytes(4096), whole + whole[:2000]):
+        file.write_bytes(sound)
+        assert not is_damaged(file)
+    for start in np.linspace(0.2, 0.7, 6):
+        at = int(start * len(whole))
+        file.write_bytes(whole[:at] + bytes(4096) + whole[at + 4096 :])
+        assert is_damaged(file), start
+
+
+@pytest.mark.parametrize("options", [{"progressive": True}, {"quality": 60}])
+def test_jpegs_with_a_grey_half_are_sound(tmp_path: Path, options: dict) -> None:
+    """They end with the grey that a decoder shows where codes are missing."""
+    image = Image.new("RGB", (640, 480), (128, 128, 128))
+    image.paste(Image.fromarray(pixels(640, 100, alpha=False)))
+    image.save(tmp_path / "a.jpg", **options)
+    assert not is_damaged(tmp_path / "a.jpg")
+
+
+def test_images_that_are_not_read_are_named(folder: Path, job: dict) -> None:
+    said = []
+    for name in ("x.tif", "near/y.DNG"):
+        (folder / "images" / name).write_bytes(b"")
+    poses.find_poses(folder, said.append)
+    assert said[0].startswith("2 images are not read as photographs (near/y.DNG, x.tif): save them as PNG or JPEG")
 
 
 def test_a_damaged_mask_is_refused(folder: Path, job: dict) -> None:
