@@ -253,6 +253,14 @@ class Lookup:
             ratio = (1 + c) / (1 - c)
         return cls(*(mi.Float(x.astype(np.float32)) for x in (1 - c, 1 + c, ratio, np.diff(c))))
 
+    @classmethod
+    def of_regular_cosines(cls, count: int) -> Lookup:
+        """The nodes of a table of ``count`` equally spaced cosines, computed by Dr.Jit."""
+        k = dr.arange(mi.Float, count)
+        step = 2 / (count - 1)
+        below, above = (count - 1 - k) * step, k * step
+        return cls(below, above, above / below, dr.full(mi.Float, step, count - 1))
+
     def normalise(self, values: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Project values (to 0 ... 1e30; all 1 if no value is above 1e-30), and find their integral and their cumulative
         distribution.

@@ -46,8 +46,9 @@ from mivol.scene_graph import list_values, traverse
 from mivol.transport.estimators.lighting.emitters import find_bounding_ball
 from mivol.transport.media.body import Body
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
-from mivol.transport.media.medium_view import Blend, MediumView, medium_kind
+from mivol.transport.media.medium_view import MediumView, medium_kind
 from mivol.transport.media.octree_extinction import OctreeExtinction
+from mivol.transport.media.phases import Phase
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.box import Box
 
@@ -453,11 +454,10 @@ class Needs(ShapeFacts):
             return None
         return replace(self, lamp_noise=None, branch_noise=None, mirror_noise=None, **_sort_parameters(differentiated))
 
-    def with_views(self, survey: SceneSurvey, phases: list[tuple[mi.Float | None, Blend | None]]) -> Needs:
+    def with_views(self, survey: SceneSurvey, phases: list[Phase]) -> Needs:
         """The same facts with the media viewed anew: a recording reads their arrays from the scene, all but ``phases``."""
-        views = (b.view(survey.grids) for b in self.boundaries)
-        known = zip(views, phases, strict=True)
-        return replace(self, views=tuple(replace(v, asymmetry=g, blend=blend) for v, (g, blend) in known))
+        views = (b.view(survey.grids, phase) for b, phase in zip(self.boundaries, phases, strict=True))
+        return replace(self, views=tuple(views))
 
     def make_media(self, scene: mi.Scene, bodies: Sequence[Body], size: float, tracer: mi.Scene | None) -> SceneMedia:
         """Build the media of the scene among its surfaces.

@@ -25,7 +25,7 @@ from mivol.space import lattice_from_world
 from mivol.transport.estimators.scores import Primal, Replay, Tangent
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
 from mivol.transport.media.extinction import to_components
-from mivol.transport.media.medium_view import Blend, read_asymmetry, read_blend
+from mivol.transport.media.phases import Phase, read_phase
 from mivol.transport.path.derivatives import carry_tangents, prepare_derivatives, replay_branches
 from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.film import CameraRays, LightOfOwnRays, RenderSamples, adjoint_rays, count_passes, render_on_film
@@ -54,8 +54,7 @@ class PreparedArrays:
         tracer: scene of the surfaces alone; None to trace the whole scene.
         balls: where emitters are (:func:`mivol.transport.estimators.lighting.emitters.read_balls`); None while ``dr.freeze``
             records.
-        phases: for each medium, the ``g`` of its stock ``hg``, and its stock ``blendphase``, which Mitsuba hides from Dr.Jit;
-            None for another phase function.
+        phases: the phase function of each medium, whose arrays Mitsuba hides from Dr.Jit.
     """
 
     readings: Readings
@@ -64,7 +63,7 @@ class PreparedArrays:
     placements: mi.Float64 | None
     tracer: mi.Scene | None
     balls: mi.Float | None
-    phases: list[tuple[mi.Float | None, Blend | None]] = field(default_factory=list)
+    phases: list[Phase] = field(default_factory=list)
 
 
 @dataclass
@@ -96,9 +95,9 @@ class PlannedScene:
     image_needs: Needs | None = None
 
     def read_arrays(self) -> PreparedArrays:
-        """The arrays of the next call. The derivatives of a ``g`` belong to one step, so they are not kept."""
-        media = [boundary.medium for boundary in self.needs.boundaries]
-        return replace(self.arrays, phases=[(read_asymmetry(medium), read_blend(medium)) for medium in media])
+        """The arrays of the next call. The derivatives of a phase function belong to one step, so they are not kept."""
+        boundaries = self.needs.boundaries
+        return replace(self.arrays, phases=[read_phase(boundary.medium.phase_function()) for boundary in boundaries])
 
     def is_for(self, state: SceneState, spp: int) -> bool:
         """Whether a scene in this state, with so many samples, has the same facts."""

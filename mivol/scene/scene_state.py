@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from mivol.scene.stand_in import ARRAYS, FOUND_SENSOR, RECORDED_FILM, describe_kind
 from mivol.scene_graph import find_children, list_values, read_value, traverse
-from mivol.transport.media.medium_view import read_blend
+from mivol.transport.media.phases import find_plugins
 from mivol.transport.path.film import find_batch_views
 
 FOLLOWED = ("data", "value")
@@ -29,14 +29,9 @@ RECORDED_BACK_ENDS = ("llvm",)
 """Back ends on which renders are recorded. On a GPU, Dr.Jit 1.5 reads the handle of a hardware texture from memory that other
 textures leave uninitialised, and aborts the process; nobody has tried recordings there."""
 
-HIDING = {
-    "BlendPhaseFunction": "; mivol_mixture can be recorded",
-    "TabulatedPhaseFunction": "; mivol_tabulated can be recorded",
-    "SGGXPhaseFunction": "",
-    "RawConstantTexture": "; the texture uniform can be recorded",
-}
-"""Plugins whose arrays Mitsuba 3.9.1 hides from Dr.Jit (their sources lack ``MI_TRAVERSE_CB``). A recording of them fails, or
-aborts the process while it fails."""
+HIDING = "BlendPhaseFunction", "TabulatedPhaseFunction", "SGGXPhaseFunction"
+"""Phase functions whose arrays Mitsuba 3.9.1 hides from Dr.Jit (their sources lack ``MI_TRAVERSE_CB``). A recording that calls
+them fails, or aborts the process while it fails."""
 
 
 @dataclass
@@ -161,11 +156,13 @@ def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:
     foreign = sorted({type(node).__name__ for node in nodes if type(node).__module__.partition(".")[0] != "mitsuba"})
     if foreign:
         return f"{foreign[0]} is a Python plugin, whose arrays may be hidden"
+    if any(node.class_name() == "RawConstantTexture" for node in nodes):
+        return "Dr.Jit cannot record a RawConstantTexture; the texture uniform can be recorded"
     media = [sensor.get_medium(), *(node for node in params.hierarchy if isinstance(node, mi.Medium))]
-    known = set(HIDING) - ({"BlendPhaseFunction"} if all(_is_closed(medium) for medium in media) else set())
-    hiding = sorted({node.class_name() for node in nodes} & known)
-    if hiding:
-        return f"Dr.Jit cannot record a {hiding[0]}{HIDING[hiding[0]]}"
+    for plugin in (plugin for medium in media if medium is not None for plugin in find_plugins(medium.phase_function())):
+        hiding = sorted({node.class_name() for node in traverse(plugin).hierarchy} & set(HIDING))
+        if hiding:
+            return f"Dr.Jit cannot record a call of a {hiding[0]} (in a mixture, or with a matrix that varies in space)"
     lost = [
         key for key, value in list_values(params) if find_gradient_array(value) is not None and not _is_followed(params, key)
     ]
@@ -178,22 +175,17 @@ def find_gradient_array(value: Any) -> Any | None:
     return array if array is not None and dr.is_diff_v(array) and dr.grad_enabled(array) else None
 
 
-def _is_closed(medium: mi.Medium | None) -> bool:
-    """Whether no kernel calls the phase function of a medium, so that its arrays are inputs."""
-    phase = None if medium is None else medium.phase_function()
-    names = "HGPhaseFunction", "IsotropicPhaseFunction"
-    return phase is None or phase.class_name() in names or read_blend(medium) is not None
-
-
 def _is_followed(params: mi.SceneParameters, key: str) -> bool:
     """Whether a recording follows the values of a parameter."""
     owner = params.properties[key][2]
     if _is_of_mivol(owner):
         return True
-    if owner.class_name() == "HGPhaseFunction":
-        # Of a medium: its ``g`` is an input. A lobe of a mixture is called through its pointer, where ``g`` is hidden.
+    if isinstance(owner, mi.PhaseFunction):
+        # Of a medium: its arrays are inputs. A lobe of a mixture is called as an object, whose arrays are hidden.
         parent = params.hierarchy[owner][0]
-        return isinstance(parent, mi.Medium) or (parent is not None and parent.class_name() == "BlendPhaseFunction")
+        while parent is not None and parent.class_name() == "BlendPhaseFunction":
+            parent = params.hierarchy[parent][0]
+        return isinstance(parent, mi.Medium)
     name = key.rpartition(".")[2]
     if isinstance(owner, mi.Volume | mi.Texture):
         return name in FOLLOWED

@@ -16,6 +16,7 @@ from mivol.scene_graph import traverse
 from mivol.transport.estimators.lighting.emitters import UNIFORM_EMITTER
 from mivol.transport.media.body import Body
 from mivol.transport.media.medium_view import MediumView, nested_field, view_medium
+from mivol.transport.media.phases import Phase
 from mivol.transport.media.stock_grids import StockGrids
 from mivol.transport.path.event import GLASS
 from mivol.transport.traversal.box import Box, fit_ball, fit_box
@@ -430,14 +431,14 @@ class Boundary:
     hole: Box | None = None
     around: OrientedBox | None = None
 
-    def view(self, grids: StockGrids) -> MediumView:
-        """View the medium as a sum of fields; ``grids`` as in :func:`mivol.transport.media.medium_view.view_medium`.
+    def view(self, grids: StockGrids, phase: Phase | None = None) -> MediumView:
+        """View the medium as a sum of fields; arguments as in :func:`mivol.transport.media.medium_view.view_medium`.
 
         Raises:
             MivolError: a medium that mivol does not render.
         """
         box = None if self.box is None or self.box.is_round else self.box
-        return view_medium(self.medium, box, grids, self.level)
+        return view_medium(self.medium, box, grids, self.level, phase)
 
     def body(self, view: MediumView, estimates_shadows: bool = False) -> Body:
         """Place a view of the medium inside its boundary."""

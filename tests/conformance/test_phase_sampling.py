@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -14,8 +12,6 @@ from scattering_scenes import PLACE, close_up, mivol, point, rough_grid
 from volpath_scenes import EMITTERS, same
 
 import scenes
-from mivol.transport.media.medium_view import view_medium
-from mivol.transport.media.scene_media import ScenePhases
 from scenes import box_of, grid_volume, medium, refused, transform
 
 
@@ -72,30 +68,6 @@ def test_phase_functions(name, kind):
     interior = medium(medium_type, grid_volume(volume_type, rough_grid(2), PLACE), 0.7, phase=PHASES[name]())
     emitters = {} if name == "sggx" else EMITTERS["envmap"]()
     same({"smoke": box_of(interior, PLACE), **emitters, "bulb": point([1.5, -1.2, 1.6], 1.5)[0]})
-
-
-def test_a_blend_in_closed_form_is_that_of_mitsuba(variant_rgb: str) -> None:
-    """Two blends, an ``hg`` and an ``isotropic``, in lanes of a medium each."""
-    lobes = {"a": {"type": "hg", "g": 0.7}, "b": {"type": "isotropic"}}
-    blends = [{"type": "blendphase", "weight": 0.3, **lobes}, PHASES["blendphase of hg"]()]
-    media = [mi.load_dict(medium("homogeneous", 1.0, 0.5, phase=p)) for p in (*blends, {"type": "hg", "g": 0.2}, lobes["b"])]
-    phases = ScenePhases([SimpleNamespace(view=view_medium(m)) for m in media])
-    assert not phases._others
-    n = 1 << 12
-    mei, k = dr.zeros(mi.MediumInteraction3f, n), dr.arange(mi.Float, n) + 0.5
-    wi, x, y = (k * step - dr.floor(k * step) for step in (0.6180339887, 0.7548776662, 0.5698402910))
-    mei.wi = mi.warp.square_to_uniform_sphere(mi.Point2f(k / n, wi))
-    mei.sh_frame, u = mi.Frame3f(mei.wi), mi.Point2f(x, y)
-    for m, g in zip(media, (0.49, 0.37, 0.2, 0.0), strict=True):
-        mei.medium = mi.MediumPtr(m)
-        wo, weight, pdf = phases.sample(mei, k / n, u, mi.Bool(True))
-        truth = np.array(m.phase_function().eval_pdf(mi.PhaseFunctionContext(None), mei, wo, mi.Bool(True))[1])
-        for found in (phases.eval(mei, wo, mi.Bool(True)).x, phases.pdf(mei, wo, mi.Bool(True)), pdf):
-            # Mitsuba's 1 + g^2 + 2 g cos has errors of 6e-8 beside (1 - g)^2 = 0.09, raised to the power 3/2.
-            np.testing.assert_allclose(np.array(found), np.broadcast_to(truth, n), rtol=1e-5)
-        assert np.all(np.array(weight) == 1)
-        # The points are a lattice of three dimensions: the mean is known to some n^(-2/3).
-        assert abs(float(dr.mean(-dr.dot(mei.wi, wo))[0]) - g) < n ** (-2 / 3)
 
 
 @pytest.mark.slow_for("a mixture", "alone")

@@ -49,6 +49,7 @@ class Body:
 
     Attributes:
         view: extinction of the medium.
+        phase: the phase function, ready to be evaluated.
         box: the boundary, if the boundary is a box or a ball; None for a traced boundary.
         edge: mean length of an edge of the box [length], as an opaque array; None without a box.
         exact_parts: the parts with a known integral along a ray.
@@ -63,6 +64,7 @@ class Body:
 
     def __init__(self, view: MediumView, box: Box | None, estimates_shadows: bool = False, hole: Box | None = None) -> None:
         self.view, self.box, self.estimates_shadows, self.hole = view, box, estimates_shadows, hole
+        self.phase = view.phase.prepare()
         self.cuts_grids = box is not None and (
             box.is_round
             or hole is not None

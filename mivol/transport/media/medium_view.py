@@ -30,25 +30,12 @@ from mivol.transport.media.extinction import BoundedExtinction, ConstantExtincti
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridExtinction
 from mivol.transport.media.octree_extinction import LeafField, OctreeExtinction
+from mivol.transport.media.phases import HenyeyGreenstein, Isotropic, Microflakes, Phase, PluginPhase, read_phase
 from mivol.transport.media.stock_grids import StockGrids
 from mivol.transport.traversal.box import Box
 from mivol.transport.traversal.lattice import Lattice
 
-__all__ = ["ASYMMETRY", "Blend", "MediumView", "nested_field", "read_asymmetry", "read_blend", "view_medium"]
-
-
-@dataclass
-class Blend:
-    """Two phase functions of Henyey and Greenstein side by side, with derivatives.
-
-    Attributes:
-        weight: share of the second one [1], to be clipped to [0, 1].
-        first, second: ``g`` of each function [1]; 0 for an ``isotropic``.
-    """
-
-    weight: mi.Float
-    first: mi.Float
-    second: mi.Float
+__all__ = ["ASYMMETRY", "MediumView", "nested_field", "view_medium"]
 
 
 @dataclass
@@ -72,9 +59,7 @@ class MediumView:
             ``mi.traverse``.
         stock_boxes: the boxes of stock grids of emission and albedo, by the pointer of the volume. Mitsuba repeats the border
             of a stock grid outside the box, where mivol has no emission.
-        is_isotropic: whether the phase function is Mitsuba's ``isotropic``.
-        asymmetry: the ``g`` of Mitsuba's ``hg`` [1], with derivatives; None for another phase function.
-        blend: Mitsuba's ``blendphase`` of ``isotropic`` or ``hg`` with a single weight, or None.
+        phase: the phase function.
     """
 
     medium: mi.Medium
@@ -89,9 +74,7 @@ class MediumView:
     emission_arrays: list = field(default_factory=list)
     stock_boxes: dict[int, Box] = field(default_factory=dict)
     numbers: dict[str, float | mi.Float | mi.Color3f] = field(default_factory=dict)
-    is_isotropic: bool = False
-    asymmetry: mi.Float | None = None
-    blend: Blend | None = None
+    phase: Phase = field(default_factory=Isotropic)
 
     def holds(self, volume: mi.Volume, p: mi.Point3f) -> mi.Bool:
         """Whether a point lies in the box of a stock volume of emission; true for volumes of mivol, which are 0 outside."""
@@ -137,7 +120,13 @@ ASYMMETRY = "phase_function.g"
 """Name of the ``g`` of a medium with Mitsuba's ``hg``, as in ``mi.traverse``."""
 
 
-def view_medium(medium: mi.Medium, boundary: Box | None = None, grids: StockGrids | None = None, level: int = 0) -> MediumView:
+def view_medium(
+    medium: mi.Medium,
+    boundary: Box | None = None,
+    grids: StockGrids | None = None,
+    level: int = 0,
+    phase: Phase | None = None,
+) -> MediumView:
     """View a medium as a sum of fields.
 
     Args:
@@ -146,6 +135,7 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, grids: StockGrid
             filling its boundary to these digits is put exactly there.
         grids: what is known of the stock grids, to read and to extend; by default nothing.
         level: level of a nested radiance field.
+        phase: the phase function, if it was read before.
 
     Raises:
         MivolError: a medium or a volume of another kind.
@@ -179,8 +169,10 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, grids: StockGrid
     emission_lattice = _emission_lattice(emission_density, light, boundary, grids)
     stock_boxes = {v.ptr: Box(grids.place(v, boundary)) for v in light if _repeats_border(v)}
     numbers = {k.partition(".")[0]: v for k, v in values if k in ("scale", *(f"{n}.value.value" for n in names))}
-    is_isotropic, asymmetry = _read_phase(medium)
-    if asymmetry is not None:
+    if phase is None:
+        phase = read_phase(medium.phase_function())
+        _check_microflakes(phase)
+    if isinstance(phase, HenyeyGreenstein):
         numbers[ASYMMETRY] = params[ASYMMETRY]
     return MediumView(
         medium,
@@ -188,16 +180,14 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, grids: StockGrid
         scale,
         albedo_arrays,
         albedo,
-        _read_microflakes(medium),
+        phase.entries if isinstance(phase, Microflakes) else None,
         emission,
         emission_density,
         emission_lattice,
         emission_arrays,
         stock_boxes,
         numbers,
-        is_isotropic,
-        asymmetry,
-        read_blend(medium),
+        phase,
     )
 
 
@@ -206,62 +196,20 @@ def _read_scale(scale: float | mi.Float) -> mi.Float:
     return dr.opaque(mi.Float, scale) if isinstance(scale, float) and scale != 1 else mi.Float(scale)
 
 
-def _read_phase(medium: mi.Medium) -> tuple[bool, mi.Float | None]:
-    """Whether the phase function of a medium is Mitsuba's ``isotropic``, and the ``g`` of Mitsuba's ``hg``."""
-    phase = medium.phase_function()
-    return phase is not None and phase.class_name() == "IsotropicPhaseFunction", read_asymmetry(medium)
+def _check_microflakes(phase: Phase) -> None:
+    """Refuse an ``sggx`` whose matrix varies in space.
 
-
-def read_asymmetry(medium: mi.Medium) -> mi.Float | None:
-    """The ``g`` of a medium with Mitsuba's ``hg`` [1], with its derivatives; None for another phase function."""
-    phase = medium.phase_function()
-    if phase is None or phase.class_name() != "HGPhaseFunction":
-        return None
-    return _keep_number(traverse(phase)["g"])
-
-
-def read_blend(medium: mi.Medium) -> Blend | None:
-    """The stock ``blendphase`` of a medium, or None. The parts must be ``isotropic`` or ``hg``, with a single weight."""
-    phase = medium.phase_function()
-    if phase is None or phase.class_name() != "BlendPhaseFunction":
-        return None
-    children, params = find_children(phase), traverse(phase)
-    lobes = [children["phase_0"].class_name(), children["phase_1"].class_name()]
-    known = {"HGPhaseFunction", "IsotropicPhaseFunction"}
-    if not known.issuperset(lobes) or "weight.value.value" not in params or len(params["weight.value.value"]) != 1:
-        return None
-    weight, *each = (params[key] if key in params else mi.Float(0) for key in ("weight.value.value", "phase_0.g", "phase_1.g"))
-    return Blend(*map(_keep_number, (weight, *each)))
-
-
-def _keep_number(number: mi.Float) -> mi.Float:
-    """Keep the derivatives of a number; without derivatives, make it an array: each literal would make a new kernel."""
-    if not dr.grad_enabled(number):
-        number = mi.Float(dr.detach(number))
-        dr.make_opaque(number)
-    return number
-
-
-def _read_microflakes(medium: mi.Medium) -> list[mi.Float] | None:
-    """The matrix S of the microflakes of a medium with an ``sggx`` phase function; otherwise None.
+    In a blend or a mixture Mitsuba lets microflakes scatter light, but leaves the extinction independent of the direction.
 
     Raises:
-        MivolError: a matrix that varies in space.
+        MivolError: a matrix that varies.
     """
-    phase = medium.phase_function()
-    # In a blend or a mixture Mitsuba lets microflakes scatter light, but leaves the extinction independent of direction.
-    if phase is None or phase.class_name() != "SGGXPhaseFunction":
-        return None
-    flat = dr.ravel(next(v for k, v in list_values(traverse(phase)) if k.startswith("S.")))
-    rows = [dr.gather(mi.Float, flat, mi.UInt32(c)) for c in range(6)]
-    if not is_recording():
-        host = np.array(dr.detach(flat)).reshape(-1, 6)
-        if not (host == host[0]).all():
-            raise MivolError(
-                f"the sggx phase function of a medium varies over its {len(host)} voxels; an extinction that "
-                "depends on the direction is exact for one S everywhere: give S as a gridvolume of one voxel."
-            )
-    return rows
+    if isinstance(phase, PluginPhase) and phase.plugin.class_name() == "SGGXPhaseFunction":
+        matrices = dr.ravel(next(v for k, v in list_values(traverse(phase.plugin)) if k.startswith("S.")))
+        raise MivolError(
+            f"the sggx phase function of a medium varies over its {dr.width(matrices) // 6} voxels; an extinction that "
+            "depends on the direction is exact for one S everywhere: give S as a gridvolume of one voxel."
+        )
 
 
 def _field(params: mi.SceneParameters, name: str) -> mi.Volume | mi.Float | mi.Color3f | None:
