@@ -8,12 +8,13 @@ failing, an import that breaks does not.
     scripts/mutate.py --sample 12 --seed 7   twelve, drawn by the seed
     scripts/mutate.py --only '*lattice*'     those whose file, test or list matches
     scripts/mutate.py --random 60 --seed 7   not these: 60 faults drawn from the whole package, and the share that the
-                                             tests of their lines notice; from a part of it with --only 'mivol/scene/*';
-                                             without the first 40 with --from 41. The default suite is run once first (with
-                                             --slow all tests), to record which tests run which line; --lines FOLDER
-                                             keeps the recording.
-    scripts/mutate.py --unrun --lines FOLDER  by this recording: the share of the statements in functions that no test
-                                             runs, by room, and their lines
+                                             tests of their lines notice; from a part of it with --only 'mivol/scene/*'.
+                                             The default suite is run once first (with --slow all tests), to record which
+                                             tests run which of these lines.
+    scripts/mutate.py --random 60 --seed 7 --faults FOLDER
+                                             only draw them: pytest -p mutation.recorder, with MIVOL_FAULTS=FOLDER and
+                                             PYTHONPATH=scripts, then puts the recording beside them
+    scripts/mutate.py --faults FOLDER        judge these; without the first 40 with --from 41
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mutation.faults import Fault, draw_faults, read_package
-from mutation.guards import ALL, group_entries, list_unrun, read_recording, record_suite
+from mutation.guards import ALL, group_entries, read_faults, read_recording, record_suite, write_faults
 from mutation.survivors import Checkout, judge_all, report
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -175,39 +176,30 @@ def draw(only: str, count: int, seed: int) -> list[Fault]:
 
 
 def judge_random(args: argparse.Namespace) -> None:
-    """Draw faults from the package and say which of them its tests notice: a measurement, whose reader judges survivors.
+    """Say which faults their tests notice: a measurement, whose reader judges survivors.
+
+    The faults and the recording of the suite are those of a folder; without one they are made here.
 
     Raises:
-        ValueError: as :func:`draw`.
+        ValueError: as :func:`draw`; or no fault is left to judge.
     """
     os.environ.setdefault("MIVOL_DATA", str(ROOT.parent / "shared" / "data"))
     # Each process of tests takes its share of the cores, as tests/conftest.py does for those of pytest-xdist.
     os.environ["PYTEST_XDIST_WORKER_COUNT"] = str(args.jobs)
-    faults = draw(args.only, args.random, args.seed)[args.first - 1 :]
     with copies(args.jobs + 1) as (untouched, *broken):
-        recording = args.lines or untouched.parent / "lines"
-        if not recording.exists():
-            record_suite(untouched, args.jobs, recording, args.slow)
+        folder = args.faults or untouched.parent / "faults"
+        if args.faults is None:
+            write_faults(folder, draw(args.only, args.random, args.seed))
+            record_suite(untouched, args.jobs, folder, args.slow)
+        faults = read_faults(folder)[args.first - 1 :]
+        if not faults:
+            raise ValueError(f"{folder} holds fewer than {args.first} faults.")
         test_files = {str(path.relative_to(ROOT)): path.read_text() for path in sorted((ROOT / "tests").rglob("test_*.py"))}
-        guards = read_recording(recording, group_entries((e.file, e.test) for e in load_entries()), test_files, args.slow)
+        guards = read_recording(folder, group_entries((e.file, e.test) for e in load_entries()), test_files, args.slow)
         guards.seconds = args.seconds
         first = Checkout(broken[0], untouched, args.limit, {test.name: test.passed for test in guards.tests})
         checkouts = [first, *(replace(first, broken=copy) for copy in broken[1:])]
         report(judge_all(faults, guards, checkouts), len(faults), lambda line: print(line, flush=True))
-
-
-def print_unrun(recording: Path, only: str) -> None:
-    """Print the statements in functions of matching files that no test of a recording runs, and their share in each room."""
-    runners, rooms = read_recording(recording, {}).runners, {}
-    for file, text in read_package(ROOT).items():
-        if fnmatch.fnmatch(file, only):
-            count, unrun = list_unrun(text, file, runners)
-            room = rooms.setdefault(file.split("/")[1].removesuffix(".py"), [0, 0])
-            room[0], room[1] = room[0] + count, room[1] + len(unrun)
-            lines = text.splitlines()
-            print(*(f"{file}:{line}: {lines[line - 1].strip()}" for line in unrun), sep="\n", end="\n" if unrun else "")
-    for room, (count, unrun) in [*sorted(rooms.items()), ("together", [sum(n) for n in zip(*rooms.values(), strict=True)])]:
-        print(f"{room:<18}{unrun:6d} of {count:6d} statements run by no test; run: {1 - unrun / max(count, 1):.1%}")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -220,20 +212,17 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--from", dest="first", type=int, default=1, metavar="N", help="of --random: continue at the Nth fault")
     parser.add_argument("--jobs", type=int, default=2, metavar="J", help="faults of --random that are judged at a time")
     parser.add_argument("--slow", action="store_true", help="of --random: record and run slow tests, too")
-    parser.add_argument("--lines", type=Path, metavar="FOLDER", help="of --random: recording to read, or to write if missing")
+    parser.add_argument("--faults", type=Path, metavar="FOLDER", help="where --random only draws to; without it: judge these")
     parser.add_argument("--seconds", type=float, default=ALL, metavar="S", help="of --random: recorded time of a fault's tests")
-    parser.add_argument("--unrun", action="store_true", help="instead of faults, the statements that no test of --lines runs")
     parser.add_argument("--limit", type=float, default=300, metavar="SECONDS", help="time that one test may take")
     args = parser.parse_args(argv)
-    if args.unrun:
-        if args.lines is None or not args.lines.is_dir():
-            parser.error("--unrun takes a recording: --lines FOLDER, as --random --lines FOLDER writes it")
-        print_unrun(args.lines, args.only)
-        return 0
-    if args.random is not None:
-        if args.jobs < 1 or not 1 <= args.first <= args.random:
-            parser.error("--random and --jobs take a number of 1 or more, --from one that is no larger than that of --random")
-        judge_random(args)
+    if args.random is not None or args.faults is not None:
+        if args.jobs < 1 or args.first < 1:
+            parser.error("--jobs and --from take a number of 1 or more")
+        if args.random is not None and args.faults is not None:
+            write_faults(args.faults, draw(args.only, args.random, args.seed))
+        else:
+            judge_random(args)
         return 0
     chosen = choose(load_entries(), args.only, args.sample, args.seed)
     if not chosen:

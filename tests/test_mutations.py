@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,8 @@ from syntax import tree_of
 
 ROOT = Path(__file__).resolve().parents[1]
 
-mutate, faults, guards, survivors = map(load, ("mutate", "mutation.faults", "mutation.guards", "mutation.survivors"))
+MODULES = ("mutate", "mutation.faults", "mutation.guards", "mutation.recorder", "mutation.survivors")
+mutate, faults, guards, recorder, survivors = map(load, MODULES)
 ENTRIES = mutate.load_entries()
 
 MOST_ENTRIES, LEAST_IN_ROOM = 400, 8
@@ -193,75 +195,95 @@ SIZE = 3
 
 
 def scale(x, factor=2):
+    'Docstring.'
     if (x
             > 0):
         return [
             x,
             factor * x,
         ]
+    elif x:
+        def inner(y=4):
+            return y
     return x
 
 
 class Box:
     edge = 1
+
+    def grow(self, by=2):
+        'Only a docstring.'
+
+    def size(self):
+        return self.edge
 """
 """A module whose statements have several lines."""
 
 
 @pytest.mark.parametrize(
-    ("line", "expected"),
+    ("line", "before"),
     [
-        (7, range(7, 9)),  # the head of a condition, without its block
-        (8, range(7, 9)),
-        (11, range(9, 13)),  # a part of a statement
-        (13, range(13, 14)),
-        (6, range(7, 14)),  # the import computes a default value: the function stands for it
-        (17, range(17, 18)),  # and an attribute of a class: the class stands for it
-        (3, range(1, 19)),  # and a constant: the file stands for it
+        (8, ["if x > 0:"]),  # the head of a condition, without its block
+        (9, ["if x > 0:"]),
+        (12, ["return [x, factor * x]"]),  # a part of a statement
+        (14, ["if x:"]),
+        (15, ["def inner(y=4):"]),  # the outer function computes a default value of the inner
+        (16, ["return y"]),
+        (17, ["return x"]),
+        (6, ["if x > 0:", "return y"]),  # the import computes a default value: the function stands for it, and what is in it
+        (23, ["Only a docstring."]),
+        (21, ["Only a docstring.", "return self.edge"]),  # and an attribute of a class: the class stands for it
+        (3, ["if x > 0:", "return y", "Only a docstring.", "return self.edge"]),  # and a constant: the file stands for it
     ],
 )
-def test_lines_of_a_statement(line: int, expected: range) -> None:
-    assert guards.lines_of(SMALL, line) == expected
+def test_probes_stand_before_the_statement_of_a_line(line: int, before: list[str]) -> None:
+    """Nothing else changes."""
+    lines = [text for text in recorder.insert_probes(SMALL, {7: line}).splitlines() if text]
+    found = [after.strip(" '") for text, after in pairwise(lines) if text.strip() == "note_fault(7)"]
+    assert found == before
+    left = "\n".join(text for text in lines if text.strip() != "note_fault(7)")
+    assert ast.dump(ast.parse(left)) == ast.dump(ast.parse(SMALL))
 
 
 @pytest.fixture
 def index() -> guards.Guards:
-    """Five tests, of which four run line 13; one of them is in the file called like the module."""
+    """Five tests, of which four run line 17 of a module; one of them is in the file called like it."""
     names = ("tests/test_b.py::t", "tests/test_b.py::u", "tests/test_b.py::p[1]", "tests/test_a.py::t", "tests/test_b.py::p[2]")
-    tests = [guards.RunTest(name, 20.0, size) for name, size in zip(names, (10, 30, 40, 90, 20), strict=True)]
-    runners = {("mivol/a.py", 13): [1, 2, 3, 4], ("mivol/a.py", 7): [0], ("mivol/b.py", 13): [0]}
-    return guards.Guards(tests, runners, {"mivol/a.py": ["tests/test_c.py::t"]})
+    t, *others = [guards.RunTest(name, seconds) for name, seconds in zip(names, (10, 30, 40, 50, 20), strict=True)]
+    runners = {fault_at(17): others, fault_at(8): [t], fault_at(17, "mivol/b.py"): [t]}
+    return guards.Guards([t, *others], runners, {"mivol/a.py": ["tests/test_c.py::t"]})
 
 
 def fault_at(line: int, file: str = "mivol/a.py") -> object:
     return faults.Fault(file, line, 0, "", "", "operator")
 
 
-def test_the_most_specific_tests_of_a_line_come_first(index) -> None:
-    """The file called like the module, then tests that run few lines, then further variants of the same test."""
-    found = [test.name for test in index.find_runners(fault_at(13), SMALL)]
+def test_the_shortest_tests_of_a_line_come_first(index) -> None:
+    """The file called like the module, then short tests, then further variants of the same test."""
+    found = [test.name for test in index.find_runners(fault_at(17))]
     assert found == ["tests/test_a.py::t", "tests/test_b.py::p[2]", "tests/test_b.py::u", "tests/test_b.py::p[1]"]
 
 
-@pytest.mark.parametrize(("seconds", "second"), [(70.0, ["tests/test_b.py::u"]), (45.0, [])])
+@pytest.mark.parametrize(("seconds", "second"), [(105.0, ["tests/test_b.py::u"]), (75.0, [])])
 def test_rounds_have_a_time(index, monkeypatch: pytest.MonkeyPatch, seconds: float, second: list[str]) -> None:
-    monkeypatch.setattr(guards, "FIRST", 45.0)
+    """The tests of the list come after those that run the line: many of them are slow."""
+    monkeypatch.setattr(guards, "FIRST", 75.0)
     index.seconds = seconds
-    first = ["tests/test_c.py::t", "tests/test_a.py::t", "tests/test_b.py::p[2]"]
-    assert index.rounds(fault_at(13), SMALL) == [first, second, [], []]
-    assert index.rounds(fault_at(13, "mivol/unknown.py"), SMALL) == [[], [], [], []]
+    first = ["tests/test_a.py::t", "tests/test_b.py::p[2]", "tests/test_c.py::t"]
+    assert index.rounds(fault_at(17), SMALL) == [first, second, [], []]
+    assert index.rounds(fault_at(17, "mivol/unknown.py"), SMALL) == [[], [], [], []]
 
 
 def test_samples_judge_code_of_renders_that_tests_run(index) -> None:
     file = "mivol/transport/a.py"
-    index.runners[file, 13] = [1]
-    assert index.rounds(fault_at(13, file), SMALL)[3] == ["-m", "slow", guards.OF_SAMPLES]
-    assert index.rounds(fault_at(13, "mivol/scene/unknown.py"), SMALL)[3] == []
+    index.runners[fault_at(17, file)] = index.tests[:1]
+    assert index.rounds(fault_at(17, file), SMALL)[3] == ["-m", "slow", guards.OF_SAMPLES]
+    assert index.rounds(fault_at(17, "mivol/scene/unknown.py"), SMALL)[3] == []
     assert (ROOT / guards.OF_SAMPLES).is_file()
     assert all((ROOT / room).is_dir() for room in guards.SAMPLING)
 
 
-@pytest.mark.parametrize(("line", "expected"), [(3, True), (6, True), (17, True), (13, False)])
+@pytest.mark.parametrize(("line", "expected"), [(3, True), (6, True), (21, True), (17, False)])
 def test_lines_of_an_import_are_judged_by_the_reference(index, line: int, expected: bool) -> None:
     """A constant, a default value and an attribute of a class; a line of a function is not of an import."""
     assert (guards.OF_IMPORTS[0] in index.rounds(fault_at(line), SMALL)[0]) == expected
@@ -270,9 +292,9 @@ def test_lines_of_an_import_are_judged_by_the_reference(index, line: int, expect
 @pytest.mark.parametrize(
     ("file", "line", "expected"),
     [
-        ("mivol/a.py", 13, ["tests/x/test_a.py"]),  # called like the module
-        ("mivol/c.py", 13, ["tests/test_two.py"]),  # no recorded test runs it: files that import it
-        ("mivol/b.py", 13, []),  # a recorded test runs it
+        ("mivol/a.py", 17, ["tests/x/test_a.py"]),  # called like the module
+        ("mivol/c.py", 17, ["tests/test_two.py"]),  # no recorded test runs it: files that import it
+        ("mivol/b.py", 17, []),  # a recorded test runs it
     ],
 )
 @pytest.mark.parametrize("slow", [True, False])
@@ -289,14 +311,6 @@ def test_slow_tests_of_a_module_come_last(index, file: str, line: int, expected:
     assert index.rounds(fault_at(line, file), SMALL)[2] == (["-m", which, *expected] if expected else [])
 
 
-def test_statements_that_no_test_runs() -> None:
-    """A condition counts by its head, a docstring and the head of a function not at all."""
-    source = "def f(x=1):\n    'Text.'\n    if (x\n            > 0):\n        return 1\n    return [\n        2\n    ]\n"
-    run = {("a.py", 4), ("a.py", 5), ("b.py", 6), ("a.py", 2)}
-    assert guards.list_unrun(source, "a.py", run) == (3, [6])
-    assert guards.list_unrun(source, "a.py", {("a.py", 7)}) == (3, [3, 5])
-
-
 def test_a_study_may_measure_something_else():
     """Constants of studies are no faults; operators are."""
     found = {f.kind for f in faults.find_faults("mivol/bench/studies/a.py", "def f(n=3):\n    return 2 * n\n")}
@@ -306,24 +320,28 @@ def test_a_study_may_measure_something_else():
 @pytest.mark.slow
 @pytest.mark.usefixtures("bare_pytest")
 def test_a_recording_tells_which_tests_run_a_line(tmp_path: Path) -> None:
-    """Lines of a shared fixture belong to every test that uses it; a test that fails is recorded like others."""
+    """Lines of a shared fixture belong to every test that uses it; a test that fails is recorded like others.
+
+    The source of a function is the one with probes: Dr.Jit compiles functions with symbolic loops from it.
+    """
     (tmp_path / "scripts").symlink_to(ROOT / "scripts")
     for name, text in {
         "mivol/__init__.py": "",
         "mivol/a.py": "def f():\n    return 1\n\n\ndef g():\n    return 2\n",
-        "tests/test_a.py": "import pytest\nfrom mivol.a import f, g\n"
+        "tests/test_a.py": "import inspect\nimport pytest\nfrom mivol.a import f, g\n"
+        "def test_s(): assert 'note_fault(0)' in inspect.getsource(f)\n"
         "@pytest.fixture(scope='module')\ndef two(): return g()\n"
         "def test_f(): assert f() == 2\ndef test_g(two): assert two == 2\ndef test_h(two): assert two + f() == 3\n",
     }.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
-    guards.record_suite(tmp_path, 1, tmp_path / "lines")
-    index = guards.read_recording(tmp_path / "lines", {})
-    source = (tmp_path / "mivol" / "a.py").read_text()
-    names = {line: {t.function.rpartition("::")[2] for t in index.find_runners(fault_at(line), source)} for line in (2, 6)}
-    assert names == {2: {"test_f", "test_h"}, 6: {"test_g", "test_h"}}
-    assert guards.list_unrun(source, "mivol/a.py", index.runners) == (2, [])
-    assert {t.name.rpartition("::")[2]: t.passed for t in index.tests} == {"test_f": False, "test_g": True, "test_h": True}
+    drawn = [fault_at(line) for line in (2, 6)]
+    guards.write_faults(tmp_path / "faults", drawn)
+    guards.record_suite(tmp_path, 1, tmp_path / "faults")
+    index = guards.read_recording(tmp_path / "faults", {})
+    names = [{t.function.rpartition("::")[2] for t in index.find_runners(fault)} for fault in drawn]
+    assert names == [{"test_f", "test_h"}, {"test_g", "test_h"}]
+    assert [t.name.rpartition("_")[2] for t in index.tests if t.passed] == ["s", "g", "h"]
 
 
 HALVING = "def half(x):\n    return x / 2\ndef least(x):\n    return x if x < 9 else 9\n"
@@ -344,10 +362,10 @@ def checkout(tmp_path: Path, bare_pytest: None, monkeypatch: pytest.MonkeyPatch)
     return survivors.Checkout(tmp_path / "broken", tmp_path / "untouched", 60.0)
 
 
-def guards_of_halving(*names: str) -> guards.Guards:
-    """Guards by which these tests run every line."""
-    tests = [guards.RunTest(f"tests/test_halving.py::{name}", 1.0, 4) for name in names or ("test_red_anyway", "test_half")]
-    return guards.Guards(tests, {("halving.py", line): range(len(tests)) for line in range(1, 5)})
+def guards_of_halving(fault: object, *names: str) -> guards.Guards:
+    """Guards by which these tests run the line of a fault."""
+    tests = [guards.RunTest(f"tests/test_halving.py::{name}", 1.0) for name in names or ("test_red_anyway", "test_half")]
+    return guards.Guards(tests, {fault: tests})
 
 
 @pytest.mark.slow
@@ -356,7 +374,7 @@ def test_a_fault_is_killed_by_a_test_that_is_green_without_it(checkout, old: str
     """9 is returned for 9 by either comparison: that fault is no fault. A test that is red anyway kills nothing."""
     start = HALVING.index(f" {old} ") + 1
     fault = faults.Fault("halving.py", 2, start, old, new, "operator")
-    index = guards_of_halving()
+    index = guards_of_halving(fault)
     verdict = survivors.judge_fault(checkout, fault, index)
     assert (verdict.killed, verdict.test) == (bool(killer), killer)
     assert (checkout.broken / "halving.py").read_text() == HALVING
@@ -365,7 +383,7 @@ def test_a_fault_is_killed_by_a_test_that_is_green_without_it(checkout, old: str
 @pytest.mark.slow
 def test_a_fault_that_nothing_can_be_imported_with_is_killed(checkout) -> None:
     fault = faults.Fault("halving.py", 1, 0, "def half(x):", "half = 1 +\\\n", "operator")
-    index = guards_of_halving()
+    index = guards_of_halving(fault)
     assert survivors.judge_fault(checkout, fault, index).killed
 
 
@@ -377,7 +395,7 @@ def test_a_test_that_is_red_by_chance_kills_nothing(checkout) -> None:
     for copy in (checkout.broken, checkout.untouched):
         (copy / "tests" / "test_halving.py").write_text(text + "    m.touch()\n    assert not first\n")
     fault = faults.Fault("halving.py", 2, HALVING.index("/"), "/", "*", "operator")
-    index = guards_of_halving("test_half")
+    index = guards_of_halving(fault, "test_half")
     assert not survivors.judge_fault(checkout, fault, index).killed
     assert mark.exists()
 
@@ -386,7 +404,7 @@ def test_a_test_that_does_not_end_kills(checkout) -> None:
     (checkout.broken / "tests" / "test_halving.py").write_text("import time\ndef test_half(): time.sleep(60)\n")
     hasty = survivors.Checkout(checkout.broken, checkout.untouched, 1.0)
     fault = faults.Fault("halving.py", 2, HALVING.index("/"), "/", "*", "operator")
-    index = guards_of_halving("test_half")
+    index = guards_of_halving(fault, "test_half")
     assert survivors.judge_fault(hasty, fault, index).test == "a test that does not end"
 
 

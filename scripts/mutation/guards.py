@@ -1,34 +1,33 @@
-"""Which tests guard a line: the tests that run it, the most specific first.
+"""Which tests guard a line: the tests that run it, the shortest first.
 
-A recording of the suite (:mod:`mutation.recorder`) tells which lines each test runs, and how long the test takes. Lines that
-only an import runs, and slow tests, are not in it: :data:`OF_IMPORTS` and the names of test files stand for them.
+A recording of the suite (:mod:`mutation.recorder`) tells which tests run the lines of drawn faults, and how long they take.
+Lines that only an import runs, and slow tests, are not in it: :data:`OF_IMPORTS` and the names of test files stand for them.
 """
 
 from __future__ import annotations
 
 import ast
+import json
 import os
-import pickle
 import re
 import subprocess
 import sys
-from array import array
 from collections import Counter
-from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cache
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 
 from mutation.faults import Fault
 
-__all__ = ["Guards", "RunTest", "group_entries", "is_of_import", "lines_of", "list_unrun", "read_recording", "record_suite"]
+__all__ = [
+    "Guards", "RunTest", "group_entries", "is_of_import", "read_faults", "read_recording", "record_suite", "write_faults",
+]  # fmt: skip
 
 FIRST, ALL = 60.0, 360.0
 """Recorded time of the tests in the first round, and in the first two rounds together [s]."""
 
 OF_IMPORTS = ("tests/test_docs.py::test_reference_is_what_the_code_says",)
 """Tests of what imports compute: default arguments, settings and tables stand on the pages of the reference."""
-
 
 OF_SAMPLES = "tests/conformance/test_drawn_pictures.py"
 """Slow tests that compare single samples of renders. A fault that changes noise but no mean is seen by no other test."""
@@ -44,13 +43,11 @@ class RunTest:
     Attributes:
         name: its node id.
         seconds: its time.
-        size: lines of the package that it runs.
         passed: whether it was green.
     """
 
     name: str
     seconds: float
-    size: int
     passed: bool = True
 
     @property
@@ -61,11 +58,11 @@ class RunTest:
 
 @dataclass
 class Guards:
-    """Tests by line.
+    """Tests by fault.
 
     Attributes:
         tests: the tests of the recording.
-        runners: indices into ``tests`` by (file of the package, line).
+        runners: those that run the line of a fault.
         listed: the tests of the entries of tests/mutations, by file of the package.
         test_files: text of each test file.
         slow: whether slow tests count.
@@ -73,22 +70,18 @@ class Guards:
     """
 
     tests: list[RunTest] = field(default_factory=list)
-    runners: dict[tuple[str, int], Iterable[int]] = field(default_factory=dict)
+    runners: Mapping[Fault, Sequence[RunTest]] = field(default_factory=dict)
     listed: dict[str, list[str]] = field(default_factory=dict)
     test_files: Mapping[str, str] = field(default_factory=dict)
     slow: bool = False
     seconds: float = ALL
 
-    def find_runners(self, fault: Fault, source: str) -> list[RunTest]:
-        """The tests that run the statement of a fault: tests in files called like the module first, then the most specific.
+    def find_runners(self, fault: Fault) -> list[RunTest]:
+        """The tests that run the statement of a fault: tests in files called like the module first, then the shortest.
 
-        The most specific test runs the fewest lines. One variant of each test comes before the further variants of all tests.
+        One variant of each test comes before the further variants of all tests.
         """
-        lines = lines_of(source, fault.line)
-        found = {k for line in lines for k in self.runners.get((fault.file, line), ())}
-        chosen = sorted(
-            (self.tests[k] for k in found), key=lambda t: (not is_named_like(t.name, fault.file), t.size, t.seconds)
-        )
+        chosen = sorted(self.runners.get(fault, ()), key=lambda t: (not is_named_like(t.name, fault.file), t.seconds))
         variants: Counter[str] = Counter()
         ranks = {}
         for test in chosen:
@@ -99,18 +92,18 @@ class Guards:
     def rounds(self, fault: Fault, source: str) -> list[list[str]]:
         """Names of tests for a fault, round by round; a round may be empty.
 
-        1. the tests of the entries of its file, and tests that run its line, ``FIRST`` seconds of them or ``seconds`` if fewer;
-           ``OF_IMPORTS`` for a line that an import runs;
+        1. tests that run its line, ``FIRST`` seconds of them or ``seconds`` if fewer; ``OF_IMPORTS`` for a line that an import
+           runs; the tests of the entries of its file;
         2. more tests that run its line, up to ``seconds``;
         3. if slow tests count, those in files called like the module. If no recorded test runs the line, all tests of these
            files, because the recording sees no other processes;
         4. ``OF_SAMPLES`` for code of renders that a recorded test runs.
         """
-        runners = self.find_runners(fault, source)
+        runners = self.find_runners(fault)
         first, rest = split_by_time(runners, min(FIRST, self.seconds))
         second = split_by_time(rest, self.seconds - FIRST)[0] if self.seconds > FIRST else []
         of_import = OF_IMPORTS if is_of_import(source, fault.line) else ()
-        one = list(dict.fromkeys([*self.listed.get(fault.file, []), *of_import, *(test.name for test in first)]))
+        one = list(dict.fromkeys([*(test.name for test in first), *of_import, *self.listed.get(fault.file, [])]))
         two = [test.name for test in second if test.name not in one]
         files = self.find_test_files(fault.file, is_unrun=not runners) if self.slow or not runners else []
         which = "not slow" if not self.slow else "slow" if runners else "slow or not slow"
@@ -145,93 +138,55 @@ def is_named_like(test: str, file: str) -> bool:
     )
 
 
-@cache
-def lines_of(source: str, line: int) -> range:
-    """The lines that run whenever the statement of this line runs.
-
-    A simple statement has its own lines, and a compound statement the lines of its head. The head of a function or a class, and
-    a statement outside functions, run during the import; the lines of the function, the class or the file then stand for them.
-    """
-    tree = ast.parse(source)
-    found = range(1, source.count("\n") + 2)
-    node: ast.AST | None = tree
-    in_function = False
-    while node is not None:
-        children = [n for n in statements_in(node) if n.lineno <= line <= n.end_lineno]
-        node = children[0] if children else None
-        if node is None:
-            break
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            found = range(node.body[0].lineno, node.end_lineno + 1)
-            in_function = isinstance(node, ast.FunctionDef) and line >= node.body[0].lineno
-        elif in_function:
-            body = getattr(node, "body", None)
-            last = body[0].lineno - 1 if body and line < body[0].lineno else node.end_lineno
-            found = range(node.lineno, max(node.lineno, last) + 1)
-    return found
-
-
 def is_of_import(source: str, line: int) -> bool:
     """Whether an import runs this line: it is outside functions, or in the head of one."""
     functions = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef)]
     return not any(f.body[0].lineno <= line <= f.end_lineno for f in functions)
 
 
-def statements_in(node: ast.AST) -> list[ast.stmt]:
-    """The statements of the blocks of a node."""
-    blocks = [getattr(node, name, []) for name in ("body", "orelse", "finalbody")]
-    handlers = [handler.body for handler in getattr(node, "handlers", [])]
-    cases = [case.body for case in getattr(node, "cases", [])]
-    return [child for block in (*blocks, *handlers, *cases) if isinstance(block, list) for child in block]
+def write_faults(folder: Path, faults: Iterable[Fault]) -> None:
+    """Put faults into a folder, which a recording then fills."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "faults.json").write_text(json.dumps([astuple(fault) for fault in faults], indent=1))
 
 
-def list_unrun(source: str, file: str, runners: Container[tuple[str, int]]) -> tuple[int, list[int]]:
-    """How many statements the functions of a module have, and the lines of those that no test runs; docstrings do not count."""
-    heads = []
-    functions = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef)]
-    for statement in {n for f in functions for n in ast.walk(f) if isinstance(n, ast.stmt) and n is not f}:
-        is_text = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
-        if is_text or isinstance(statement, ast.Pass | ast.Global | ast.Nonlocal | ast.FunctionDef | ast.ClassDef):
-            continue
-        body = getattr(statement, "body", None) or getattr(statement, "cases", None)
-        last = max(statement.lineno, _first_line(body[0]) - 1) if body else statement.end_lineno
-        heads.append(range(statement.lineno, last + 1))
-    return len(heads), sorted(head.start for head in heads if not any((file, line) in runners for line in head))
+def read_faults(folder: Path) -> list[Fault]:
+    """The faults of a folder of :func:`write_faults`."""
+    return [Fault(*fields) for fields in json.loads((folder / "faults.json").read_text())]
 
 
-def _first_line(node: ast.stmt | ast.match_case) -> int:
-    return node.pattern.lineno if isinstance(node, ast.match_case) else node.lineno
+def record_suite(copy: Path, jobs: int, folder: Path, slow: bool = False) -> None:
+    """Run the default suite of a checkout under the recorder, or the slow tests as well.
 
-
-def record_suite(copy: Path, jobs: int, target: Path, slow: bool = False) -> None:
-    """Run the default suite of a checkout under the recorder, or the slow tests as well; the recording is a folder of parts.
+    Args:
+        folder: of :func:`write_faults`.
 
     Raises:
         RuntimeError: pytest wrote no recording.
     """
-    target.mkdir(parents=True, exist_ok=True)
     env = dict(os.environ, PYTHONPATH=f"{copy}{os.pathsep}{copy / 'scripts'}", PYTHONDONTWRITEBYTECODE="1")
-    env["MIVOL_LINES"] = str(target)
+    env["MIVOL_FAULTS"] = str(folder)
     env.pop("PYTEST_XDIST_WORKER_COUNT", None)
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "mutation.recorder"]
     command += ["-n", str(jobs), "--dist", "worksteal"] if jobs > 1 else ["-p", "no:xdist"]
     command += ["-m", "slow or not slow"] if slow else []
     done = subprocess.run(command, cwd=copy, env=env, capture_output=True, text=True, errors="replace", check=False)
-    if not any(target.iterdir()):
+    if not any(folder.glob("part*.json")):
         raise RuntimeError(f"pytest ends with {done.returncode} and wrote no recording:\n{(done.stdout + done.stderr)[-2000:]}")
 
 
 def read_recording(
-    path: Path, listed: dict[str, list[str]], test_files: Mapping[str, str] | None = None, slow: bool = False
+    folder: Path, listed: dict[str, list[str]], test_files: Mapping[str, str] | None = None, slow: bool = False
 ) -> Guards:
-    """The guards of a recording: a folder with a part of each process of tests. The rest as in :class:`Guards`."""
-    tests, runners = [], {}
-    for part in sorted(path.iterdir()):
-        own, lines = pickle.loads(part.read_bytes())
-        for place, indices in lines.items():
-            runners.setdefault(place, array("H")).extend(k + len(tests) for k in indices)
-        tests += own
-    return Guards([RunTest(*test) for test in tests], runners, listed, test_files or {}, slow)
+    """The guards of a folder to which each process of tests wrote a part. The rest as in :class:`Guards`."""
+    faults, tests = read_faults(folder), []
+    runners: dict[Fault, list[RunTest]] = {fault: [] for fault in faults}
+    for part in sorted(folder.glob("part*.json")):
+        for name, seconds, passed, indices in json.loads(part.read_text()):
+            tests.append(RunTest(name, seconds, passed))
+            for k in indices:
+                runners[faults[k]].append(tests[-1])
+    return Guards(tests, runners, listed, test_files or {}, slow)
 
 
 def group_entries(entries: Iterable[tuple[str, str]]) -> dict[str, list[str]]:

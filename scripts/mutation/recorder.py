@@ -1,82 +1,71 @@
-"""A plugin of pytest that records which lines of the package each test runs, how long it takes, and whether it passes.
+"""A plugin of pytest that records which tests run the lines of drawn faults, how long each test takes, and whether it passes.
 
-Run it as ``pytest -p mutation.recorder`` with the folder ``scripts`` on the path of Python; the environment variable
-``MIVOL_LINES`` names a folder for the recording, to which each process of tests writes a part.
+Run it as ``pytest -p mutation.recorder`` with the folder ``scripts`` on the path of Python. The environment variable
+``MIVOL_FAULTS`` names the folder in which ``scripts/mutate.py --random N --faults FOLDER`` put the faults. Each process of
+tests writes its part of the recording there. Files without a fault are imported as they are, and run at full speed.
 """
 
 from __future__ import annotations
 
+import ast
+import builtins
+import json
+import linecache
 import os
-import pickle
-import sys
-import threading
 import time
-from array import array
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
-from types import FrameType
+from types import CodeType
 from typing import Any
+
+from mutation.guards import is_of_import, read_faults
 
 import pytest
 
-Lines = set[tuple[str, int]]
-"""(file, line) pairs."""
-
 
 class Recorder:
-    """Traces the functions of one folder.
+    """Notes which faults' lines each test runs.
 
     Attributes:
-        tests: (node id, seconds, number of lines, whether it passed) of each test, in the order of the run.
-        runners: indices into ``tests`` by (file, line); files are relative to the checkout.
+        folder: where the recording is written.
+        tests: name, seconds, whether it passed, and indices of faults of each test, in the order of the run.
     """
 
-    def __init__(self, root: str, package: str) -> None:
-        self.root, self.folder = root, f"{root}{os.sep}{package}{os.sep}"
-        self.tests: list[tuple[str, float, int, bool]] = []
-        self.runners: dict[tuple[str, int], array] = {}
-        self._lines: Lines = set()
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.tests: list[tuple[str, float, bool, list[int]]] = []
+        self._faults: set[int] = set()
         self._passed = True
-        self._of_fixtures: dict[str, Lines] = {}
+        self._of_fixtures: defaultdict[str, set[int]] = defaultdict(set)
 
-    def start(self) -> None:
-        """Trace this thread and each new one."""
-        threading.settrace(self._trace_call)
-        sys.settrace(self._trace_call)
-
-    def _trace_call(self, frame: FrameType, event: str, argument: Any) -> Any:
-        return self._trace_line if frame.f_code.co_filename.startswith(self.folder) else None
-
-    def _trace_line(self, frame: FrameType, event: str, argument: Any) -> Any:
-        self._lines.add((frame.f_code.co_filename, frame.f_lineno))
-        return self._trace_line
+    def note(self, fault: int) -> None:
+        """The line of this fault runs now."""
+        self._faults.add(fault)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef: Any) -> Iterator[None]:
         """The lines of a fixture that several tests share count for each of these tests."""
         if fixturedef.scope == "function":
             return (yield)
-        before, self._lines = self._lines, set()
+        before, self._faults = self._faults, set()
         try:
             return (yield)
         finally:
-            self._of_fixtures.setdefault(fixturedef.argname, set()).update(self._lines)
-            self._lines |= before
+            self._of_fixtures[fixturedef.argname] |= self._faults
+            self._faults |= before
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
         """Record one test."""
-        self._lines, self._passed = set(), True
+        self._faults, self._passed = set(), True
         start = time.perf_counter()
-        self.start()
         try:
             return (yield)
         finally:
-            sys.settrace(None)
-            lines = self._lines.union(*(self._of_fixtures.get(name, ()) for name in getattr(item, "fixturenames", ())))
-            for file, line in lines:
-                self.runners.setdefault((file[len(self.root) + 1 :], line), array("H")).append(len(self.tests))
-            self.tests.append((item.nodeid, time.perf_counter() - start, len(lines), self._passed))
+            faults = self._faults.union(*(self._of_fixtures[name] for name in getattr(item, "fixturenames", ())))
+            self.tests.append((item.nodeid, time.perf_counter() - start, self._passed, sorted(faults)))
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Note whether a part of a test is red."""
@@ -84,13 +73,56 @@ class Recorder:
 
     def pytest_sessionfinish(self) -> None:
         """Write the recording, each worker of pytest-xdist a part of it."""
-        worker = os.environ.get("PYTEST_XDIST_WORKER", "")
         if self.tests:
-            folder = Path(os.environ["MIVOL_LINES"])
-            folder.mkdir(parents=True, exist_ok=True)
-            (folder / f"part{worker}").write_bytes(pickle.dumps((self.tests, self.runners)))
+            (self.folder / f"part{os.environ.get('PYTEST_XDIST_WORKER', '')}.json").write_text(json.dumps(self.tests))
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    """Begin."""
-    config.pluginmanager.register(Recorder(str(config.rootpath), os.environ.get("MIVOL_PACKAGE", "mivol")))
+def insert_probes(source: str, lines: Mapping[int, int]) -> str:
+    """Source that calls ``note_fault(k)`` before the statement of line ``lines[k]``.
+
+    Defaults of arguments, attributes of classes and constants of files are computed by an import. The functions inside their
+    function, class or file call it then.
+    """
+    tree = ast.parse(source)
+    found = {k: _find_statements(tree, line, is_of_import(source, line)) for k, line in lines.items()}
+    for k, statement in [(k, statement) for k, statements in found.items() for statement in statements]:
+        for block in [block for node in ast.walk(tree) for block in vars(node).values() if isinstance(block, list)]:
+            if statement in block:
+                block.insert(block.index(statement), ast.parse(f"note_fault({k})").body[0])
+    return ast.unparse(tree)
+
+
+def _find_statements(tree: ast.Module, line: int, of_import: bool) -> list[ast.stmt]:
+    around = [n for n in ast.walk(tree) if isinstance(n, ast.stmt) and n.lineno <= line <= n.end_lineno]
+    if not of_import:
+        return around[-1:]
+    owner = next((n for n in reversed(around) if isinstance(n, ast.FunctionDef | ast.ClassDef)), tree)
+    functions = [n for n in ast.walk(owner) if isinstance(n, ast.FunctionDef)]
+    # After the docstring, if another statement follows it.
+    return [f.body[ast.get_docstring(f) is not None and len(f.body) > 1] for f in functions]
+
+
+def load_with_probes(lines: Mapping[str, Mapping[int, int]]) -> None:
+    """From now on, import these files with the probes of their lines. Neither reads nor writes their bytecode."""
+    get_code = SourceFileLoader.get_code
+
+    def get_code_with_probes(loader: SourceFileLoader, name: str) -> CodeType | None:
+        if loader.path not in lines:
+            return get_code(loader, name)
+        text = insert_probes(Path(loader.path).read_text(), lines[loader.path])
+        # Dr.Jit compiles functions with symbolic loops anew, from the source that it finds here.
+        linecache.cache[loader.path] = len(text), None, text.splitlines(keepends=True), loader.path
+        return compile(text, loader.path, "exec", dont_inherit=True)
+
+    SourceFileLoader.get_code = get_code_with_probes
+
+
+def pytest_load_initial_conftests(early_config: pytest.Config) -> None:
+    """Begin, before conftest.py imports the package."""
+    recorder = Recorder(Path(os.environ["MIVOL_FAULTS"]))
+    early_config.pluginmanager.register(recorder)
+    builtins.note_fault = recorder.note
+    lines: defaultdict[str, dict[int, int]] = defaultdict(dict)
+    for k, fault in enumerate(read_faults(recorder.folder)):
+        lines[str(early_config.rootpath / fault.file)][k] = fault.line
+    load_with_probes(lines)
