@@ -32,6 +32,7 @@ from mivol.fields.field_files import write_field
 from mivol.fields.sky import read_sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_columns, read_exr, read_projections, read_stack, write_exr, write_png
+from mivol.files.image_stack import read_header_angles
 from mivol.files.mesh import Mesh, read_ply, write_mesh
 from mivol.files.nikon import read_nikon, read_nikon_angles, read_nikon_transmission
 from mivol.files.npy import read_archive
@@ -143,6 +144,21 @@ def _zarr_3(folder: Path) -> None:
 
     store = {"driver": "zarr3", "kvstore": {"driver": "file", "path": str(folder)}}
     tensorstore.open(store, create=True, dtype="float32", shape=(2, 3, 4)).result()[...] = numbered()[..., 0]
+
+
+def _raw_toml(folder: Path) -> None:
+    (folder / "a.raw").write_bytes(_raw())
+    (folder / "a.toml").write_text('shape = [2, 3, 4]\ndtype = "float32"\nspacing = [1, 2, 3]\nunit = "mm"\n')
+
+
+def _edf_views(folder: Path) -> None:
+    """The angles are in the headers."""
+    from fabio.edfimage import EdfImage
+
+    for k in range(3):
+        head = {"motor_mne": "sx srot", "motor_pos": f"1.5 {60 * k}"}
+        EdfImage(data=np.full((4, 20), 500 + k, "u2"), header=head).write(str(folder / f"view_{k}.edf"))
+    EdfImage(data=np.full((4, 20), 1000, "u2")).write(str(folder / "flat.edf"))
 
 
 def _slices(folder: Path) -> None:
@@ -314,7 +330,7 @@ def _of(values: np.ndarray) -> list[tuple]:
     return [(i, j, k, float(values[k, j, i, 0]), 9.0) for k in range(z) for j in range(y) for i in range(x)]
 
 
-PACKAGES = {"edf": "fabio", "zarr": "tensorstore", "zarr 3": "tensorstore"}
+PACKAGES = {"edf": "fabio", "folder of edf": "fabio", "zarr": "tensorstore", "zarr 3": "tensorstore"}
 """Package of ``mivol[lab]`` without which a format is neither written nor read, by key of :data:`FILES` and :data:`SETS`."""
 
 FILES: dict[str, tuple[str, Write, Read]] = {
@@ -389,6 +405,12 @@ SETS: dict[str, tuple[Write, tuple[str, ...], Read]] = {
     "nrrd detached": (_detached_nrrd, ("a.nhdr", "a.raw"), lambda folder: mivol.read_volume(folder / "a.nhdr")),
     "metaimage detached": (_detached_metaimage, ("a.mhd", "a.raw"), lambda folder: mivol.read_volume(folder / "a.mhd")),
     "raw by a header": (_detached_metaimage, ("a.mhd", "a.raw"), lambda folder: mivol.read_volume(folder / "a.raw")),
+    "raw by a toml": (_raw_toml, ("a.toml", "a.raw"), lambda folder: mivol.read_volume(folder / "a.raw")),
+    "folder of edf": (
+        _edf_views,
+        ("view_0.edf", "view_2.edf", "flat.edf"),
+        lambda folder: (draft_scan(folder), read_stack(folder / "view_*.edf"), read_header_angles(folder / "view_*.edf")),
+    ),
     "nxtomo": (
         lambda folder: write_nxtomo(folder / "a.nxs"),
         ("a.nxs", "a_frames.h5"),

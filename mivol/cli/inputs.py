@@ -22,8 +22,9 @@ def explain(arguments: argparse.Namespace) -> int:
 
     For photographs, explain lists present and missing data, and draws the cameras with --output. For points and
     Gaussians, it prints their number, extent, sizes and opacities; for a volume or a field, its size, values and place. A
-    folder with a DICOM series counts as a volume. A folder of TIFF files without flat and dark images and angles does too,
-    unless --set makes it a scan. If mivol refuses the input, explain prints the reason after the facts, and the exit code is 1.
+    folder with a DICOM series counts as a volume. A folder of TIFF files without flat and dark images and angles does too, and
+    a TIFF file of several pages without flats or darks beside it, unless --set makes it a scan. If mivol refuses the input,
+    explain prints the reason after the facts, and the exit code is 1.
     """
     from mivol.photos import find_format
     from mivol.points.summary import is_points_file
@@ -89,8 +90,9 @@ def draft_scan_of(path: Path, arguments: argparse.Namespace, is_array: bool = Fa
     """Return the settings of a scan without a TOML file; None for other inputs.
 
     An HDF5 file without the layout of a scan counts as a scan if its suffix is no volume suffix, or with ``--set``;
-    ``--dataset`` makes it a volume. A folder of TIFF files that ``is_array`` counts as a scan if it has flats, darks or angles,
-    or with ``--set``; a single image that ``is_array`` counts as a sinogram with ``--set``.
+    ``--dataset`` makes it a volume. A folder of TIFF files that ``is_array`` counts as a scan if it has flats, darks or angles
+    (a file of several pages: flats or darks beside it), or with ``--set``; a single image that ``is_array`` counts as a
+    sinogram with ``--set``.
 
     Raises:
         MivolError: as :func:`mivol.experiments.found_scan.draft_scan`.
@@ -130,6 +132,9 @@ def check_contents(path: Path) -> None:
             check_file(path)
         found = describe_missing(path) or "a volume"
         raise MivolError(f"{path}: found {found}, expected a scene, a fit or points; render, explain and convert take it.")
+    if path.suffix.lower() == ".npz":
+        way_out = 'projections are data.file of a TOML file with data.source = "stack"'
+        raise MivolError(f"{path}: found an archive of NumPy, expected a scene, a fit or points; {way_out}.")
 
 
 def holds_volume(path: Path) -> bool:

@@ -24,7 +24,7 @@ from mivol.errors import MivolError
 from mivol.files.dicom_views import DicomViews, has_views, read_views, survey_views
 from mivol.files.formats import HEAD, read_volume
 from mivol.files.hdf5 import is_hdf5
-from mivol.files.image_stack import IMAGES, read_images, stack_shape
+from mivol.files.image_stack import IMAGES, read_header_angles, read_images, stack_shape
 from mivol.files.mrc import TILT_ANGLES, find_tilt_angles, is_mrc, read_tilt_angles
 from mivol.files.nikon import SECTION, read_nikon
 from mivol.files.scan_hdf5 import half_turns_in_radians, is_scan, survey_projections
@@ -85,6 +85,8 @@ def describe_missing(path: Path) -> str:
     if find_scan(path) in (TIFF_FOLDER, SINOGRAM):
         way_out = "mivol optimize takes it as a scan, mivol explain does so with --set"
         return f"a volume, for want of flats, darks and angles: {way_out}"
+    if path.suffix.lower() in (".npy", ".npz") and path.is_file():
+        return 'a volume: as projections (views, rows, columns) it is data.file of a TOML file with data.source = "stack"'
     if path.suffix.lower() in (".mrc", ".st", ".ali") and path.is_file():
         names = " or ".join(f"{path.stem}{suffix}" for suffix in TILT_ANGLES)
         return f"a volume, for want of angles: a tilt series has a file {names} beside it, a line or a section for each image"
@@ -380,9 +382,12 @@ def _draft_tilt_series(path: Path, given: dict[str, Any]) -> ScanDraft:
 
 
 def has_scan_files(folder: Path) -> bool:
-    """Whether flats, darks, angles or a scanner's file lie beside the images of a folder: they tell a scan from slices."""
+    """Whether flats, darks, angles or a scanner's file lie beside the images of a folder: they tell a scan from slices.
+
+    For a file of several pages, whether flats or darks of its size lie beside it.
+    """
     if not folder.is_dir():
-        return False
+        return any(group.words & (FLAT_WORDS | DARK_WORDS) for group in _groups_beside(folder)[1:])
     if any(group.words & (FLAT_WORDS | DARK_WORDS) for group in group_images(folder, IMAGES)):
         return True
     for file in folder.iterdir():
@@ -499,6 +504,11 @@ def _draft_angles(folder: Path, scan: dict[str, Any], data: dict[str, Any], view
             data |= {"angles": str(file), "angle_unit": unit}
             return [f"found: {file.name}: angles from {angles[0]:.4g} to {angles[-1]:.4g}, taken as {unit}s by their arc"]
         others.append(f"{file.name} has {len(angles)}")
+    if (motor := read_header_angles(data["file"])) and len(motor[1]) == views:
+        name, angles = motor
+        data |= {"angles": data["file"], "angle_unit": "radian" if half_turns_in_radians(angles) else "degree"}
+        in_unit = f"from {angles[0]:.4g} to {angles[-1]:.4g}, taken as {data['angle_unit']}s"
+        return [f"found: {name} in the headers: angles {in_unit}; a file of angles as data.angles replaces them"]
     arc, why = guess_arc(three)
     scan["arc"] = arc
     told = f" ({', '.join(others)})" if others else ""

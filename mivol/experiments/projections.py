@@ -39,7 +39,7 @@ from mivol.tomography.preprocess import (
 )
 from mivol.tomography.projector import Projector
 from mivol.tomography.rings import FIRST_WIDTH, RING_WIDTHS, find_zingers, remove_rings
-from mivol.tomography.rotation_axis import find_axis
+from mivol.tomography.rotation_axis import axis_from_entropy, find_axis
 from mivol.tomography.single_material import filter_phase
 
 RAY_BYTES = 3 * 8
@@ -257,6 +257,11 @@ def read_measured(settings: config.ScanExperiment, base: Path, rows: slice = ALL
     transmission, corrections, shown = correct_pixels(data, transmission)
     notes += [*lost_notes, *air_notes, *corrections]
     measured, weights = to_line_integrals(transmission)
+    if not weights.any():
+        raise MivolError(
+            "found no reading of the views with light, expected some: give flats of the same exposure, which are as bright as "
+            "air in the views, and darks below the views."
+        )
     y, ring_notes = correct_rings(measured, weights, data)
     notes += ring_notes
     removed = None if y is measured else (measured - y)[:, y.shape[1] // 2]
@@ -458,24 +463,33 @@ def resolve_axis(
     if beam.tilt and search is None:
         return None, [f"the axis is tilted by {np.degrees(beam.tilt):g} degrees: it is {known_place}"]
     if search or (search is None and not known):
-        offset, note = find_rotation_axis(beam, y, weights, known_place)
-        return offset, [note]
+        offset, notes = find_rotation_axis(beam, y, weights, known_place, search == "entropy")
+        return offset, notes
     if search is None:
         return None, [f"the rotation axis is {known_place}: data.find_axis = true looks for it"]
     return None, []
 
 
 def find_rotation_axis(
-    beam: ParallelBeam | ConeBeam, y: np.ndarray, weights: np.ndarray, known_place: str
-) -> tuple[float | None, str]:
-    """Return the ``axis_offset`` of a circular scan [length] and a note; None if a cone beam does not determine it.
+    beam: ParallelBeam | ConeBeam, y: np.ndarray, weights: np.ndarray, known_place: str, by_entropy: bool = False
+) -> tuple[float | None, list[str]]:
+    """Return the ``axis_offset`` of a circular scan [length] and notes; None if a cone beam does not determine it.
 
     Raises:
-        MivolError: as :func:`mivol.tomography.rotation_axis.find_axis`, for a parallel beam.
+        MivolError: as :func:`mivol.tomography.rotation_axis.find_axis` or :func:`axis_from_entropy`, for a parallel beam.
     """
     used = weights.any((1, 2))
     if not used.all():  # a view without readings has no mirror image
         y, weights, beam = y[used], weights[used], replace(beam, angles=beam.angles[used])
+    if by_entropy:
+        axis = axis_from_entropy(y, weights, beam.angles)
+        note = f"rotation axis at column {axis.column:.2f} ({axis.method}; no standard deviation is known)"
+        try:
+            other = find_axis(y, weights, beam.angles)
+            judged = f"data.find_axis = true says column {other.column:.2f} +- {other.uncertainty:.2f} ({other.method})"
+        except MivolError as error:
+            judged = f"data.find_axis = true finds none: {error}"
+        return axis.offset(y.shape[2], beam.pitch[1]) + beam.detector_offset[1], [note, judged]
     if isinstance(beam, ParallelBeam):
         axis = find_axis(y, weights, beam.angles)
         offset = axis.offset(y.shape[2], beam.pitch[1]) + beam.detector_offset[1]
@@ -483,9 +497,9 @@ def find_rotation_axis(
         try:
             axis = axis_from_fans(y, weights, beam)
         except MivolError as error:
-            return None, f"the rotation axis is {known_place}: {error}"
+            return None, [f"the rotation axis is {known_place}: {error}"]
         offset = cone_axis_offset(axis, beam)
-    return offset, f"rotation axis at column {axis.column:.2f} +- {axis.uncertainty:.2f} ({axis.method})"
+    return offset, [f"rotation axis at column {axis.column:.2f} +- {axis.uncertainty:.2f} ({axis.method})"]
 
 
 def count_measured_quanta(settings: config.ScanExperiment, readings: ScanReadings, light: np.ndarray | None = None) -> Quanta:

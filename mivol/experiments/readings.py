@@ -21,7 +21,7 @@ from mivol.errors import MivolError
 from mivol.files import read_projections, read_stack
 from mivol.files.dicom_views import has_views, survey_views
 from mivol.files.fetch import resolve_path
-from mivol.files.image_stack import ALL, stack_shape
+from mivol.files.image_stack import ALL, read_header_angles, stack_shape
 from mivol.files.mrc import read_tilt_angles
 from mivol.files.nikon import NikonScan, read_nikon, read_nikon_angles, read_nikon_transmission
 from mivol.files.scan_hdf5 import NO_DARKS, survey_projections
@@ -162,7 +162,13 @@ def read_angles(settings: config.ScanExperiment, base: Path, views: int) -> np.n
     if not data.angles:
         return even_angles(settings.scan, views)
     file = base / data.angles
-    angles = survey_views(file).angles if has_views(file) else read_tilt_angles(file)
+    if file.suffix.lower() == ".edf":
+        motor = read_header_angles(file)
+        if motor is None:
+            raise refusal(file, "no motor of a rotation that moves", "one in each header", "give a text file as data.angles")
+        angles = motor[1]
+    else:
+        angles = survey_views(file).angles if has_views(file) else read_tilt_angles(file)
     if len(angles) != views:
         raise MivolError(f"{data.angles} has {len(angles)} angles for {views} projections: give one for each.")
     return to_radians(angles, data.angle_unit)

@@ -142,7 +142,7 @@ UNREAD: dict[str, tuple[Callable[[bytes], bool], str]] = {
     ),
     RAW_BYTES: (
         lambda head: b"\0" in head,
-        "say size and type by --shape and --dtype (shape= and dtype= in Python), or in a header .nhdr or .mhd beside them",
+        "say size and type by --shape and --dtype (shape= and dtype= in Python), or in a file .nhdr, .mhd or .toml beside them",
     ),
 }
 
@@ -349,7 +349,9 @@ def is_volume(path: Path) -> bool:
         return True
     if path.suffix.lower() == ".npy" and path.is_file():
         return npy.count_axes(path) > 2
-    return path.is_file() and not path.name.lower().endswith(tuple(FORMATS)) and raw.find_header(path) is not None
+    if not path.is_file() or path.name.lower().endswith(tuple(FORMATS)):
+        return False
+    return raw.find_header(path) is not None or bool(raw.read_layout(path))
 
 
 LARGEST_DENSE = 1 << 28
@@ -451,6 +453,8 @@ def convert_volume(source: Path, target: Path, dataset: str | None = None, **lay
     unit = str(volume.meta.get("unit") or "")
     if suffix in (".nii", ".tif", ".tiff", ".zarr", ".npz"):
         facts |= {"unit": unit} if unit else {}
+        if suffix == ".nii" and unit in tiff.METRES and unit not in nifti.UNITS.values():
+            lost.append(f"the unit {unit}")
     elif unit in tiff.METRES and (suffix, unit) != (".mrc", "A"):
         lost.append(f"the unit {unit}")
     if suffix in SPARSE_READERS and "grid" in volume.meta:
@@ -548,6 +552,8 @@ def _find_format(path: Path, shape: Sequence[int] | None = None, dtype: np.dtype
         if header := raw.find_header(path):
             named = FORMATS[header.suffix]
             return VolumeFormat(f"raw bytes by {header.name}", named.recognise, lambda _, dataset: named.read(header, dataset))
+        if layout := raw.read_layout(path):
+            return VolumeFormat("raw bytes by a TOML file", lambda _: True, lambda file, _: raw.read_raw(file, **layout))
         raise refuse_unread(path)
     suffix = _find_suffix(path, FORMATS)
     head = _read_head(path)

@@ -10,7 +10,7 @@ import logging
 import os
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -186,6 +186,19 @@ def _read_detector_images(file: Path) -> np.ndarray:
     """
     if file.suffix.lower() == ".his":
         return _read_his(file)
+    frames = _read_edf(file, lambda frame: np.asarray(frame.data))
+    if len({frame.shape for frame in frames}) != 1 or frames[0].ndim != 2 or frames[0].dtype.kind not in "uif":
+        found = f"frames of shapes {[frame.shape for frame in frames[:3]]} and type {frames[0].dtype}"
+        raise refusal(file, found, "grey frames of one size", "copy the file again")
+    return np.stack(frames).astype(np.float32)
+
+
+def _read_edf(file: Path, read: Callable[[Any], Any]) -> list[Any]:
+    """What ``read`` returns for each of fabio's frames of an EDF file.
+
+    Raises:
+        MivolError: no fabio, or a damaged file.
+    """
     try:
         import fabio
     except ImportError as error:
@@ -202,17 +215,51 @@ def _read_detector_images(file: Path) -> np.ndarray:
     try:
         with fabio.open(str(file)) as image:
             # getframe of a file with a single frame opens the file of that number beside it.
-            several = (np.asarray(image.getframe(k).data) for k in range(image.nframes))
-            frames = [np.asarray(image.data)] if image.nframes == 1 else list(several)
-        if len({frame.shape for frame in frames}) != 1 or frames[0].ndim != 2 or frames[0].dtype.kind not in "uif":
-            raise ValueError(f"frames of shapes {[frame.shape for frame in frames[:3]]}")
+            return [read(image)] if image.nframes == 1 else [read(image.getframe(k)) for k in range(image.nframes)]
     except Exception as error:  # fabio's parsers raise errors of many classes
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         way_out = "copy the file again"
         raise refusal(file, f"a damaged or foreign file ({reason})", file.suffix[1:].upper(), way_out) from error
     finally:
         log.setLevel(level)
-    return np.stack(frames).astype(np.float32)
+
+
+ANGLE_WORDS = "theta", "rot", "angle", "omega"
+"""Parts of the names of motors that turn a sample."""
+
+
+def read_header_angles(path: str | os.PathLike) -> tuple[str, np.ndarray] | None:
+    """Name and angles (views,) [degree] of the motor that turns the sample, from the headers of EDF files.
+
+    A header has a motor as a key, or in the lists ``motor_mne`` and ``motor_pos`` of the ESRF.
+
+    Args:
+        path: EDF file, or a pattern of EDF files.
+
+    Returns:
+        None without EDF, or if no motor or several motors with the name of a rotation move from view to view.
+
+    Raises:
+        MivolError: as :func:`read_stack`.
+    """
+    files = _find_files(path)
+    if any(file.suffix.lower() != ".edf" for file in files):
+        return None
+    heads = [_read_motors(head) for file in files for head in _read_edf(file, lambda frame: dict(frame.header))]
+    names = [name for name in heads[0] if any(word in name.lower() for word in ANGLE_WORDS)]
+    tables = {name: np.array([head.get(name, np.nan) for head in heads]) for name in names}
+    moving = {name: angles for name, angles in tables.items() if np.isfinite(angles).all() and np.ptp(angles) > 0}
+    return next(iter(moving.items())) if len(moving) == 1 else None
+
+
+def _read_motors(head: dict[str, Any]) -> dict[str, float]:
+    """Numbers in an EDF header by name."""
+    listed = zip(str(head.get("motor_mne", "")).split(), str(head.get("motor_pos", "")).split(), strict=False)
+    numbers = {}
+    for name, text in (*head.items(), *listed):
+        with suppress(ValueError):
+            numbers[name] = float(text)
+    return numbers
 
 
 @contextmanager

@@ -135,6 +135,7 @@ def read_projections(
         notes += (NO_DARKS,)
         stacks["darks"] = np.zeros((1, *projections.shape[1:]), np.float32)
     _check_projections(path, stacks, {role: frames.name for role, frames in scan.frames.items()}, angles)
+    _check_brightness(path, stacks, data.dtype)
     return ProjectionData(
         projections, stacks["flats"], stacks["darks"], angles, meta, (*scan.notes, *notes), scan.pitch, scan.distances
     )
@@ -205,6 +206,32 @@ class Frames(NamedTuple):
     indices: np.ndarray | None = None
 
 
+class _ThinDataset:
+    """A dataset without its first axes of length 1, so that three axes remain."""
+
+    def __init__(self, dataset: Any) -> None:
+        extra = [axis for axis, size in enumerate(dataset.shape) if size == 1][: dataset.ndim - 3]
+        self._dataset, self._extra = dataset, extra
+        self.shape = tuple(size for axis, size in enumerate(dataset.shape) if axis not in extra)
+        self.ndim = len(self.shape)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._dataset, name)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, index: slice | tuple[slice, ...]) -> Any:
+        given = iter(index if isinstance(index, tuple) else (index,))
+        axes = range(self._dataset.ndim)
+        return self._dataset[tuple(0 if axis in self._extra else next(given, slice(None)) for axis in axes)]
+
+
+def _thin(dataset: Any) -> Any:
+    """Return a dataset of frames with at most three axes, if its others have the length 1."""
+    return _ThinDataset(dataset) if dataset.ndim > 3 else dataset
+
+
 @dataclasses.dataclass(frozen=True)
 class _Scan:
     """The datasets of a scan. ``angles`` has the dataset and the indices of its views, or is None."""
@@ -236,7 +263,7 @@ def _find_scan(file: Any, path: Path, group: str, names: Mapping[str, str]) -> _
             scan = _exchange(file, path, group or "exchange", names)
         else:
             raise _no_layout(file, path)
-    frames = scan.frames | {r: Frames(read_name(file, path, n), n) for r, n in names.items() if r != "angles"}
+    frames = scan.frames | {r: Frames(_thin(read_name(file, path, n)), n) for r, n in names.items() if r != "angles"}
     angles = Frames(read_name(file, path, names["angles"]), names["angles"]) if "angles" in names else scan.angles
     return dataclasses.replace(scan, frames=frames, angles=angles, notes=(*notes, *scan.notes))
 
@@ -258,7 +285,7 @@ def _exchange(file: Any, path: Path, group: str, names: Mapping[str, str]) -> _S
     parts = {"data": "data", "flats": "data_white", "darks": "data_dark", "angles": "theta"}
     # Flats are needed, but their absence has a refusal of its own.
     found = {
-        role: Frames(_dataset(file, path, group, part), part)
+        role: Frames(_thin(_dataset(file, path, group, part)), part)
         for role, part in parts.items()
         if role not in names and (role == "data" or has_link(file, f"{group}/{part}"))
     }
@@ -272,7 +299,7 @@ def _nxtomo(file: Any, path: Path, entry: str, names: Mapping[str, str]) -> _Sca
     holder = f"{entry}/{key_name.rpartition('/')[0]}"
     key = np.asarray(find_item(file, path, f"{entry}/{key_name}")).ravel()
     data_name = next((n for n in (f"{holder}/data", f"{entry}/data/data") if has_link(file, n)), f"{holder}/data")
-    data = find_item(file, path, data_name)
+    data = _thin(find_item(file, path, data_name))
     if data.ndim != 3 or len(key) != len(data):
         raise refusal(
             path,
@@ -359,7 +386,7 @@ def _has_frames(entry: Any, holder: str) -> bool:
     """Whether the frames of a detector can be read: a link may miss its target."""
     name = next((n for n in (f"{holder}/data", "data/data") if has_link(entry, n)), None)
     try:
-        return name is not None and getattr(entry[name], "ndim", 0) == 3
+        return name is not None and getattr(entry[name], "ndim", 0) >= 3
     except (KeyError, OSError):
         return False
 
@@ -490,3 +517,11 @@ def _check_projections(path: Path, stacks: dict[str, np.ndarray], names: dict[st
             found = f"{numbers[index]} in {names.get(role, role)} at {index}, counted from 0 among the {role}"
             way_out = "repair the angles" if role == "theta" else "replace it by 0: a reading of 0 has weight 0"
             raise refusal(path, found, "finite numbers", way_out)
+
+
+def _check_brightness(path: Path, stacks: dict[str, np.ndarray], kind: np.dtype) -> None:
+    """Refuse flats that are brighter than numbers of the views' type can be, such as sums of several flats."""
+    brightest, most = float(stacks["flats"].max()), np.iinfo(kind).max if kind.kind in "ui" else np.inf
+    if brightest > most * (1 + 1e-6):  # float32 rounds the largest numbers of 32 bits up
+        found = f"flats of up to {brightest:.6g}, which are brighter than the detector of the views can be"
+        raise refusal(path, found, f"at most {most} ({kind})", "divide a sum of flats by their number")

@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy import interpolate, ndimage
+from scipy import interpolate, ndimage, stats
 
 from mivol.errors import MivolError
-from mivol.tomography.filtered import filtered_backprojection, widest_gap
+from mivol.tomography.filtered import covers_circle, filtered_backprojection, widest_gap
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.preprocess import interpolate_gaps
 from mivol.tomography.projector import Projector
@@ -197,6 +197,96 @@ def find_axis(y: np.ndarray, weights: np.ndarray, angles: np.ndarray) -> Axis:
     if apart > FAR * rough.uncertainty:
         return replace(rough, method=f"{rough.method}; reconstructions say {fine.column:.2f}, which does not count")
     return rough
+
+
+def axis_from_entropy(y: np.ndarray, weights: np.ndarray, angles: np.ndarray) -> Axis:
+    """Find the axis at which filtered back-projection has the histogram of least entropy (Donath et al. 2006).
+
+    A wrong axis blurs edges, and blurred edges spread the histogram. The search covers the middle half of the detector. It adds
+    the entropies of up to five rows, each of a disc about the axis that all views see; readings beyond the detector count as
+    the outermost ones. So the object may be wider than the detector. Over many columns the entropy also follows the light that
+    views lack, so the minimum is that of the entropy less its median over neighbouring columns. Columns are averaged first, and
+    halved in each further step.
+
+    No standard deviation is known: with much noise or rings, all rows agree on a wrong column.
+
+    Args:
+        y: (views, rows, cols) line integrals.
+        weights: inverse variances of ``y``.
+        angles: (views,) [rad].
+
+    Raises: MivolError: directions missing in half a turn, or no column, or several, with a clear minimum.
+    """
+    y, _, angles = _average_views(interpolate_gaps(y, weights), weights, np.asarray(angles, float))
+    if not covers_circle(angles, np.pi):
+        raise MivolError(
+            "found directions missing in half a turn, expected all of them for the entropy of slices: give scan.axis_offset, "
+            "or data.find_axis = true."
+        )
+    count = min(ENTROPY_ROWS, y.shape[1])
+    y = y[:, ((np.arange(count) + 0.5) * y.shape[1] / count).astype(int)]
+    n = y.shape[2]
+    at_once = 2 ** int(np.ceil(np.log2(max(1.0, n / ENTROPY_COLUMNS))))
+    columns = np.arange(n / 4, 3 * n / 4, at_once)
+    total = _slice_entropies(y, angles, columns, at_once)
+    dips = total - ndimage.median_filter(total, ENTROPY_TREND, mode="nearest")
+    best = int(np.argmin(dips[DIP:-DIP])) + DIP if len(dips) > 2 * DIP else 0
+    others = dips[abs(np.arange(len(dips)) - best) > DIP]
+    if not dips[best] < 0 or others.min() < DIP_RUNNER_UP * dips[best]:
+        raise MivolError(
+            f"found no column from {columns[0]:.0f} to {columns[-1]:.0f} whose slice has clearly the least entropy, expected "
+            "one: give scan.axis_offset, or data.find_axis = true."
+        )
+    column = columns[best]
+    while True:
+        at_once = max(1, at_once // 2)
+        columns = column + at_once * np.arange(-1.5, 2.0, 0.5)
+        total = _slice_entropies(y, angles, columns, at_once)
+        column = columns[np.argmin(total)]
+        if at_once == 1:
+            break
+    a, b, _ = np.polyfit(columns - column, total, 2)
+    column += np.clip(-b / (2 * a), -0.5, 0.5) if a > 0 else 0.0
+    return Axis(float(column), np.nan, f"least entropy of slices, {y.shape[1]} rows")
+
+
+ENTROPY_ROWS, ENTROPY_COLUMNS = 5, 256
+"""Most rows, and columns of the first step, of the search for the least entropy."""
+
+ENTROPY_TREND, DIP, DIP_RUNNER_UP = 13, 4, 0.4
+"""Columns of the median that is subtracted from entropies, columns about a minimum that belong to it, and the most that
+another minimum may be of the deepest one."""
+
+
+def _slice_entropies(y: np.ndarray, angles: np.ndarray, columns: np.ndarray, at_once: int) -> np.ndarray:
+    """Entropies of slices (columns,), sums over rows, for trial columns; ``at_once`` columns are averaged to a pixel.
+
+    The bins of a row are the same for all trials: the root of the number of pixels, over half more than the range of the first
+    slice.
+    """
+    views, rows, n = y.shape
+    width = n // at_once
+    means = y[..., : width * at_once].reshape(views, rows, width, at_once).mean(-1)
+    smooth = ndimage.gaussian_filter1d(means, ENTROPY_SMOOTHING, axis=-1, mode="nearest")
+    padded = np.pad(smooth, ((0, 0), (0, 0), (width // 2, width // 2)), mode="edge")
+    reach = min(width, ENTROPY_COLUMNS) // 4
+    from_axis = np.arange(-reach, reach + 1)
+    disc = np.hypot(from_axis[:, None], from_axis) <= reach
+    grid, edges, entropies = VoxelGrid((rows, *disc.shape)), None, []
+    for column in columns:
+        offset = (column - (at_once - 1) / 2) / at_once - (width - 1) / 2
+        beam = ParallelBeam(angles, padded.shape[1:], axis_offset=offset)
+        values = filtered_backprojection(Projector(beam, grid), padded, "hann")[:, disc]
+        if edges is None:
+            low, high = np.percentile(values, [0.5, 99.5], axis=1)
+            edges = np.linspace(1.25 * low - 0.25 * high, 1.25 * high - 0.25 * low, int(np.sqrt(disc.sum())), axis=1)
+            edges[:, 0], edges[:, -1] = -np.inf, np.inf
+        entropies.append(sum(stats.entropy(np.histogram(*row)[0]) for row in zip(values, edges, strict=True)))
+    return np.array(entropies)
+
+
+ENTROPY_SMOOTHING = 1.5
+"""Standard deviation [columns] of the smoothing before slices: without it, noise hides the minimum."""
 
 
 AIR_SHARE, MASS_SCATTER = 0.02, 0.02

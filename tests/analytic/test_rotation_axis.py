@@ -119,6 +119,46 @@ def test_a_constant_and_its_deviation() -> None:
     assert axes._fit_first_coefficient(np.ones((1, 1)), np.array([7.0])) == pytest.approx((7, 0))
 
 
+def spots(degrees: np.ndarray, column: float, n: int = 96) -> np.ndarray:
+    """Shadows of 60 round spots, up to 90 columns from an axis (views, 2, n); the detector sees about half of them."""
+    rng = np.random.default_rng(3)
+    theta, s = np.radians(degrees)[:, None, None], np.arange(n) - column
+    row = np.array([[1.0], [0.8]])
+    parts = zip(rng.uniform(0.5, 2, 60), 90 * np.sqrt(rng.uniform(0, 1, 60)), rng.uniform(0, 7, 60), strict=True)
+    return sum(h * np.exp(-(((s - row * r * np.cos(theta + p)) / 2) ** 2) / 2) for h, r, p in parts)
+
+
+@pytest.mark.parametrize("column", [40.3, 52.75])
+def test_the_axis_of_the_least_entropy(column: float, variant_rgb: str) -> None:
+    """A region of interest, without noise: the column is found to half of the last step of half a column, backwards too."""
+    degrees = np.arange(150) * 1.2
+    y = spots(degrees, column)
+    axis = axes.axis_from_entropy(y, np.ones(y.shape), np.radians(degrees))
+    assert abs(axis.column - column) < 0.25 and np.isnan(axis.uncertainty)
+    assert axis.method == "least entropy of slices, 2 rows"
+    turned = axes.axis_from_entropy(y[..., ::-1].copy(), np.ones(y.shape), -np.radians(degrees))
+    assert abs(turned.column - (95 - column)) < 0.25
+
+
+def test_averaged_columns_have_the_axis_of_columns(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Means of two columns: column c is (c - 1 / 2) / 2 there, and half a column would be seen in steps of a quarter."""
+    degrees, columns = np.arange(150) * 1.2, np.arange(42.0, 47.0, 0.25)
+    y = spots(degrees, 44.5)
+    entropies = axes._slice_entropies(y, np.radians(degrees), columns, 2)
+    assert abs(columns[entropies.argmin()] - 44.5) <= 0.25
+    monkeypatch.setattr(axes, "ENTROPY_COLUMNS", 64)
+    assert abs(axes.axis_from_entropy(y, np.ones(y.shape), np.radians(degrees)).column - 44.5) < 0.25
+
+
+def test_slices_without_a_clear_least_entropy_are_refused(variant_rgb: str) -> None:
+    """Noise, and directions that are missing in half a turn."""
+    degrees = np.arange(150) * 1.2
+    noise = np.random.default_rng(5).normal(size=(150, 2, 96))
+    assert_refused("clearly the least entropy", axes.axis_from_entropy, noise, np.ones(noise.shape), np.radians(degrees))
+    missing = np.radians(degrees * 0.8)
+    assert_refused("directions missing in half a turn", axes.axis_from_entropy, noise, np.ones(noise.shape), missing)
+
+
 def test_moments_follow_a_circle() -> None:
     """Two rows of one pixel of mass each: centres of mass at 5 + cos and 5 + 2 sin; both rows say 5."""
     angles = np.linspace(0, 2 * np.pi, 7)

@@ -11,11 +11,13 @@ import pytest
 from refusals import assert_refused
 from sound_files import his_bytes
 
+from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.experiments.found_scan import draft_scan
+from mivol.experiments.readings import read_angles
 from mivol.files import image_stack, read_volume, write_volume
-from mivol.files.image_stack import read_stack, stack_shape
+from mivol.files.image_stack import read_header_angles, read_stack, stack_shape
 from mivol.files.mrc import read_tilt_angles
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import shepp_logan
@@ -186,6 +188,48 @@ def test_a_folder_of_edf_is_a_scan(tmp_path: Path, capsys) -> None:
     assert main(["explain", str(tmp_path)]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "scan_#.edf: 20 views of 4 x 32 pixels" in said and "ref_#.edf: 2 flats" in said
+
+
+@pytest.mark.parametrize("kind", ["motors", "key", "frames"])
+def test_angles_in_the_headers_of_edf(tmp_path: Path, kind: str) -> None:
+    """A motor of the ESRF's lists, a key, and a file of several frames; the TOML finds them again."""
+    edf = pytest.importorskip("fabio.edfimage")
+    degrees, images = np.arange(20) * 9.0, np.full((20, 4, 32), 500, np.uint16)
+    heads = [
+        {"motor_mne": "sx srot name", "motor_pos": f"2 {angle} x"} if kind == "motors" else {"Omega": str(angle), "rot": "1"}
+        for angle in degrees
+    ]
+    if kind == "frames":
+        file = edf.EdfImage(data=images[0], header=heads[0])
+        for image, head in zip(images[1:], heads[1:], strict=True):
+            file.append_frame(data=image, header=head)
+        file.write(str(tmp_path / "scan.edf"))
+    else:
+        for k, head in enumerate(heads):
+            edf.EdfImage(data=images[k], header=head).write(str(tmp_path / f"scan_{k:02d}.edf"))
+    edf.EdfImage(data=2 * images[0]).write(str(tmp_path / "flat.edf"))
+    draft = draft_scan(tmp_path)
+    name = "srot" if kind == "motors" else "Omega"
+    assert any(f"found: {name} in the headers: angles from 0 to 171, taken as degrees" in line for line in draft.lines)
+    assert draft.raw["data"]["angles"] == draft.raw["data"]["file"] and "arc" not in draft.raw["scan"]
+    found = read_angles(config.from_dict(draft.raw), Path(), 20)
+    np.testing.assert_allclose(found, np.radians(degrees))
+
+
+def test_headers_of_edf_without_an_angle(tmp_path: Path) -> None:
+    """No motor that moves, and two that move."""
+    edf = pytest.importorskip("fabio.edfimage")
+    for name, heads in {
+        "still": ({"rot": "1"}, {"rot": "1"}),
+        "two": ({"rot": "1", "theta": "2"}, {"rot": "3", "theta": "4"}),
+    }.items():
+        for k, head in enumerate(heads):
+            edf.EdfImage(data=np.ones((3, 4), np.uint16), header=head).write(str(tmp_path / f"{name}_{k}.edf"))
+        assert read_header_angles(tmp_path / f"{name}_*.edf") is None
+    edf.EdfImage(data=np.ones((3, 4), np.uint16)).write(str(tmp_path / "flat.edf"))
+    data = {"source": "stack", "file": "still_*.edf", "angles": "still_*.edf", "reading": "intensity", "flats": "flat.edf"}
+    scan = config.from_dict({"title": "a", "scan": {"beam": "parallel"}, "data": data})
+    assert_refused("no motor of a rotation that moves", read_angles, scan, tmp_path, 2)
 
 
 def test_angles_of_an_mdoc_without_angles_are_refused(tmp_path: Path) -> None:

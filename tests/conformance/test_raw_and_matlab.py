@@ -55,6 +55,33 @@ def test_a_header_beside_raw_bytes_is_found(tmp_path: Path, capsys: pytest.Captu
     assert_refused("found raw bytes with", read_volume, tmp_path / "a.raw")
 
 
+@pytest.mark.parametrize("name", ["a.toml", "a.raw.toml"])
+def test_a_toml_file_beside_raw_bytes_is_found(tmp_path: Path, capsys: pytest.CaptureFixture, name: str) -> None:
+    """Size, type and place; a TOML file without size and type, such as an experiment, is none."""
+    (tmp_path / "a.raw").write_bytes(VALUES.astype(">i2").tobytes())
+    (tmp_path / name).write_text('title = "a scan of some shape and dtype"')
+    assert_refused("in a file .nhdr, .mhd or .toml beside them", read_volume, tmp_path / "a.raw")
+    layout = 'shape = [2, 3, 4]\ndtype = ">i2"\nspacing = [0.5, 1, 2]\norigin = [3, 4, 5]\nunit = "mm"\n'
+    (tmp_path / name).write_text(layout)
+    volume = read_volume(tmp_path / "a.raw")
+    np.testing.assert_array_equal(volume.values[..., 0], VALUES)
+    np.testing.assert_allclose((volume.spacing, volume.origin), ((0.5, 1, 2), (3, 4, 5)))
+    assert volume.meta["unit"] == "mm"
+    assert run("explain", tmp_path / "a.raw") == 0
+    assert "raw bytes by a TOML file\n" in capsys.readouterr().out
+    assert run("convert", tmp_path / "a.raw", tmp_path / "b.zarr") == 0
+    assert read_volume(tmp_path / "b.zarr").meta["unit"] == "mm"
+    for wrong, said in (
+        (layout.replace("0.5", ".5"), "found invalid TOML"),
+        (layout + "voxel = 3\n", "found voxel = 3, expected shape ="),
+        (layout.replace("4]", '"4"]'), r"found shape = \[2, 3, '4'\]"),
+        (layout.replace("[3, 4, 5]", "[3, 4]"), "expected three numbers"),
+        (layout.replace("0.5", "0"), "degenerate box"),
+    ):
+        (tmp_path / name).write_text(wrong)
+        assert_refused(said, read_volume, tmp_path / "a.raw")
+
+
 @pytest.mark.parametrize(
     ("shape", "dtype", "found"),
     [

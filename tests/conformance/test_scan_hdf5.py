@@ -14,7 +14,7 @@ from refusals import assert_refused
 from mivol.errors import MivolError
 from mivol.files import read_projections
 from mivol.files.hdf5 import broken_links
-from mivol.files.scan_hdf5 import NO_DARKS, half_turns_in_radians, is_scan
+from mivol.files.scan_hdf5 import NO_DARKS, half_turns_in_radians, is_scan, survey_projections
 
 
 @pytest.mark.parametrize("name", ["a.nxs", "a.hdf", "a.he5", "a.h5", "a.hdf5", "a"])
@@ -169,6 +169,33 @@ def test_what_cannot_be_read_is_said_in_a_sentence(tmp_path: Path, case: str) ->
     with pytest.raises(MivolError, match=SENTENCES[case]) as refused:
         read_projections(path)
     assert str(refused.value).startswith(str(path)) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 3])
+def test_axes_of_length_1_are_left_out(tmp_path: Path, axis: int) -> None:
+    """In NXtomo, and in datasets by name; an image with two such axes is one flat."""
+    path = write_nxtomo(tmp_path / "a.nxs")
+    change(path, "entry/instrument/detector/data", np.expand_dims(FRAMES, axis))
+    data = read_projections(path, rows=slice(1, 2))
+    np.testing.assert_array_equal(data.projections, FRAMES[VIEWS, 1:2])
+    named = write_named(tmp_path / "b.h5")
+    change(named, "scan/camera/frames", np.expand_dims(FRAMES[VIEWS], axis))
+    change(named, "before/reference", FRAMES[0][None, None])
+    names = {"data": "scan/camera/frames", "flats": "before/reference"}
+    assert survey_projections(named, "", names, None).frames == (5, 1, 0)
+    data = read_projections(named, names=names)
+    np.testing.assert_array_equal(data.projections, FRAMES[VIEWS])
+    np.testing.assert_array_equal(data.flats, FRAMES[:1])
+
+
+def test_flats_brighter_than_the_detector_are_refused(tmp_path: Path) -> None:
+    """Views of 16 bits end at 65535; flats as sums do not."""
+    path = write_named(tmp_path / "a.h5")
+    names = {"data": "scan/camera/frames", "flats": "before/reference"}
+    change(path, "before/reference", np.full((2, 3), 65535.0))
+    read_projections(path, names=names)
+    change(path, "before/reference", np.full((2, 3), 70000.0))
+    assert_refused("flats of up to 70000, which are brighter .* at most 65535", read_projections, path, names=names)
 
 
 def test_a_part_that_is_missing_is_no_zero(tmp_path: Path) -> None:

@@ -178,7 +178,7 @@ def test_assumptions_that_changes_replace_are_not_told(tmp_path: Path) -> None:
 
 
 def test_a_file_of_pages_is_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    """Flats and darks beside it count if their images are as large; explain takes it for a volume without --set."""
+    """Flats and darks beside it count if their images are as large; without them, explain takes it for a volume."""
     tifffile = pytest.importorskip("tifffile")
     images = write_tiffs(tmp_path / "scan")
     views = np.stack([np.asarray(Image.open(file)) for file in sorted(images.glob("scan12_*"))])
@@ -187,10 +187,21 @@ def test_a_file_of_pages_is_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture
     data = draft_scan(tmp_path / "views.tif").raw["data"]
     assert data["file"] == str(tmp_path / "views.tif") and data["flats"] == str(tmp_path / "flats.tif") and "darks" not in data
     assert main(["explain", str(tmp_path / "views.tif")]) == 0
+    assert "found: flats.tif: 2 flats" in capsys.readouterr().out
+    (tmp_path / "flats.tif").unlink()
+    assert main(["explain", str(tmp_path / "views.tif")]) == 0
     assert "mivol optimize takes it as a scan" in capsys.readouterr().out
 
 
 BLOCKS = {"unlike": ((1, 12, 0), (2, 9, 2)), "even at first": ((1, 12, np.pi / 2), (1, 12, -np.pi / 2), (1, 6, np.pi / 2))}
+
+
+def test_arrays_of_numpy_are_told_the_way_to_a_scan(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    np.save(tmp_path / "views.npy", np.ones((4, 3, 5)))
+    np.savez(tmp_path / "scan.npz", views=np.ones((4, 3, 5)), flats=np.ones((2, 3, 5)))
+    for verb, name in (("explain", "views.npy"), ("optimize", "views.npy"), ("optimize", "scan.npz")):
+        assert main([verb, str(tmp_path / name)]) == (verb == "optimize")
+        assert 'data.file of a TOML file with data.source = "stack"' in "".join(capsys.readouterr())
 
 
 def test_a_single_image_is_a_sinogram(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -274,6 +274,30 @@ def test_an_axis_that_is_found_takes_the_place_of_the_settings(measured: ScanRea
     assert "rotation axis at column 1.75 +- 0.12 (some way)" in found.notes
 
 
+def test_the_axis_by_entropy_is_told_beside_the_other(measured: ScanReadings, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The found axis without a deviation, and what the usual methods say, or why they say nothing."""
+    monkeypatch.setattr(projections, "axis_from_entropy", lambda y, w, angles: Axis(1.75, np.nan, "entropy"))
+    monkeypatch.setattr(projections, "find_axis", lambda y, w, angles: Axis(1.5, 0.125, "some way"))
+    found = projections.read_measured(scan(find_axis="entropy"), Path())
+    assert found.geometry.axis_offset == 0.375
+    assert "rotation axis at column 1.75 (entropy; no standard deviation is known)" in found.notes
+    assert "data.find_axis = true says column 1.50 +- 0.12 (some way)" in found.notes
+
+    def refuse(*_: object) -> Axis:
+        raise MivolError("no axis.")
+
+    monkeypatch.setattr(projections, "find_axis", refuse)
+    found = projections.read_measured(scan(find_axis="entropy"), Path())
+    assert "data.find_axis = true finds none: no axis." in found.notes
+
+
+def test_views_without_any_light_are_refused(measured: ScanReadings, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Flats that are far too bright leave no reading above its noise."""
+    monkeypatch.setattr(projections, "to_line_integrals", lambda t: (np.zeros(t.value.shape), np.zeros(t.value.shape)))
+    with pytest.raises(MivolError, match="found no reading of the views with light, expected some: give flats"):
+        projections.read_measured(scan(find_axis=True), Path())
+
+
 def test_an_offset_in_the_settings_holds_where_nothing_more_is_said(
     measured: ScanReadings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -424,6 +448,8 @@ def test_an_axis_is_found_on_a_circle_only() -> None:
     for changed, found in (("", "find_axis"), ("find_axis = true", "grid")):
         raw = text + (data if not changed else data.replace(", find_axis = true", ""))
         assert_refused(found, config.from_dict, tomllib.loads(raw), "t.toml")
+    raw = text.replace("lift = 1, ", "") + data.replace("= true", '= "entropy"')
+    assert_refused('"entropy" needs beam = "parallel"', config.from_dict, tomllib.loads(raw), "t.toml")
 
 
 LIMITS = {
