@@ -203,7 +203,7 @@ def test_a_file_that_is_no_volume_lists_the_formats(tmp_path: Path, capsys: pyte
         ("a.h5.gz", b"\x1f\x8b\x08\x00", "a file compressed by gzip", "unpack it (gunzip)"),
         ("a.fits", b"SIMPLE  =                    T", "a FITS file", "as .npy (astropy.io.fits)"),
         ("a.txrm", bytes.fromhex("d0cf11e0a1b11ae1") + bytes(8), "a file of a Zeiss (Xradia) scanner", "as TIFF and text"),
-        ("a.raw", bytes(64), "raw bytes", ".nhdr or .mhd"),
+        ("a.raw", bytes(64), "raw bytes", ".nhdr, .mhd or .toml"),
     ],
 )
 @pytest.mark.parametrize("words", [("explain",), ("render",), ("optimize",), ("convert", "b.vol")])
