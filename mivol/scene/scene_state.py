@@ -8,12 +8,14 @@ code is traced.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from mivol.scene.foreign_plugins import UnfollowedStateError, describe_foreign, is_foreign
 from mivol.scene.stand_in import ARRAYS, FOUND_SENSOR, RECORDED_FILM, describe_kind
 from mivol.scene_graph import find_children, list_values, read_value, traverse
 from mivol.transport.media.phases import find_plugins
@@ -106,6 +108,9 @@ class SceneState:
             before: ``values`` of an earlier state.
         """
         differentiated = []
+        for node in filter(is_foreign, params.hierarchy):
+            with suppress(UnfollowedStateError):
+                self._sort(node, False, describe_foreign(node, params.hierarchy))
         for key in params.properties:
             value, owner = read_value(params, key), params.properties[key][2]
             numbers = value if dr.is_array_v(value) else getattr(value, "matrix", None)
@@ -139,8 +144,8 @@ class SceneState:
 def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:
     """Reason why a recording would miss arrays or derivatives of a scene; None if it finds every array.
 
-    A recording must find every array. Dr.Jit finds the arrays of Mitsuba's plugins and the attributes of Python plugins. It
-    aborts the process at an array outside both.
+    A recording must find every array. Dr.Jit finds the arrays of Mitsuba's plugins and the attributes of Python plugins. At an
+    array outside both it raises an error, or aborts the process if a plugin of Mitsuba hides the array.
     """
     if mi.variant().partition("_")[0] not in RECORDED_BACK_ENDS:
         return f"recordings have not been tried with {mi.variant()}"
@@ -152,11 +157,12 @@ def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:
         what = f" with a sampler of the kind {sensor.sampler().class_name()}" if strange[0] in ARRAYS else ""
         return f"the sensor is a {strange[0]}{what}"
     params = traverse(scene)
-    nodes = [node for node in params.hierarchy if not _is_of_mivol(node)]
-    foreign = sorted({type(node).__name__ for node in nodes if type(node).__module__.partition(".")[0] != "mitsuba"})
-    if foreign:
-        return f"{foreign[0]} is a Python plugin, whose arrays may be hidden"
-    if any(node.class_name() == "RawConstantTexture" for node in nodes):
+    try:
+        for node in filter(is_foreign, params.hierarchy):
+            describe_foreign(node, params.hierarchy)
+    except UnfollowedStateError as error:
+        return str(error)
+    if any(node.class_name() == "RawConstantTexture" for node in params.hierarchy):
         return "Dr.Jit cannot record a RawConstantTexture; the texture uniform can be recorded"
     media = [sensor.get_medium(), *(node for node in params.hierarchy if isinstance(node, mi.Medium))]
     for plugin in (plugin for medium in media if medium is not None for plugin in find_plugins(medium.phase_function())):
@@ -179,6 +185,8 @@ def _is_followed(params: mi.SceneParameters, key: str) -> bool:
     """Whether a recording follows the values of a parameter."""
     owner = params.properties[key][2]
     if _is_of_mivol(owner):
+        return True
+    if is_foreign(owner):
         return True
     if isinstance(owner, mi.PhaseFunction):
         # Of a medium: its arrays are inputs. A lobe of a mixture is called as an object, whose arrays are hidden.

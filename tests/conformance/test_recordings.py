@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import itertools
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -33,6 +34,7 @@ from mivol.kernel_recording import (
     without_garbage_collection,
 )
 from mivol.scene import plan, readings, render_tasks, scene_state, session
+from mivol.scene.foreign_plugins import UnfollowedStateError, describe_foreign
 from mivol.scene.scene_state import SceneState, find_hidden_arrays
 from mivol.scene.stand_in import FORMATS, StandIn, describe_kind
 from mivol.threads import set_thread_count
@@ -713,14 +715,183 @@ def test_what_cannot_be_recorded_is_named() -> None:
     assert find_hidden_arrays(lobed, lobed.sensors()[0]) == f"a recording does not follow the derivative by {key}"
 
 
-def test_a_python_plugin_of_another_package_is_not_recorded() -> None:
-    class Foreign(mi.BSDF):
+GAIN = 0.5
+"""Read by a plugin, as a constant of its module."""
+
+
+def tilt(cosine: mi.Float) -> mi.Float:
+    return GAIN * cosine
+
+
+class Unseen:
+    """An object that a plugin may keep."""
+
+    gain = 0.5
+
+
+def load_tilted(**attributes: object) -> tuple[mi.Scene, mi.PhaseFunction]:
+    """A scene with a phase function (1 + b c gain cos) / 4 pi, as a user would write it."""
+
+    class Tilted(mi.PhaseFunction):
+        factor = 1.0
+
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
+            self.m_flags = int(mi.PhaseFunctionFlags.Anisotropic)
+            self.terms, self.b = {"c": [0.5]}, mi.Float(0.9)
+            self.__dict__.update(attributes)
 
-    mi.register_bsdf("test_foreign", Foreign)
-    scene = smoke_under(ball={"type": "sphere", "bsdf": {"type": "test_foreign"}})
-    assert find_hidden_arrays(scene, scene.sensors()[0]) == "Foreign is a Python plugin, whose arrays may be hidden"
+        def flags(self, index: object = None, active: mi.Bool = True) -> int:
+            return self.m_flags
+
+        def sample(
+            self, ctx: object, mei: mi.MediumInteraction3f, _: mi.Float, two: mi.Point2f, active: mi.Bool = True
+        ) -> tuple:
+            wo = mi.warp.square_to_uniform_sphere(two)
+            return wo, self.eval_pdf(ctx, mei, wo, active)[0] * 4 * dr.pi, mi.Float(1 / (4 * dr.pi))
+
+        def eval_pdf(self, ctx: object, mei: mi.MediumInteraction3f, wo: mi.Vector3f, active: mi.Bool = True) -> tuple:
+            value = 1 + self.factor * self.b * self.terms["c"][0] * tilt(-dr.dot(mei.wi, wo))
+            return mi.Spectrum(value / (4 * dr.pi)), mi.Float(1 / (4 * dr.pi))
+
+        def traverse(self, callback: mi.TraversalCallback) -> None:
+            callback.put("b", self.b, mi.ParamFlags.Differentiable)
+
+        def to_string(self) -> str:
+            return "Tilted"
+
+    mi.register_phase("test_tilted", Tilted)
+    scene = smoke_under(phase={"type": "test_tilted"}, sun=sun([0.3, 0.2, -1.0])[0])
+    return scene, scene.shapes()[0].interior_medium().phase_function()
+
+
+def test_a_python_plugin_is_recorded_while_its_attributes_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Arrays are followed; a number anywhere else records anew."""
+    scene, phase = load_tilted()
+    assert find_hidden_arrays(scene, scene.sensors()[0]) is None
+    pair, pictures, counts = Pair(scene, 3), [], []
+
+    def note() -> None:
+        for call in range(2):
+            pair.assert_same(call)
+        pictures.append(pair.images(1)[0])
+        counts.append(pair.recordings.count)
+
+    note()
+    pair.scale(INSIDE + "phase_function.b", 0.9)
+    note()
+    pair.scale(INSIDE + "phase_function.b", 0.9)
+    note()
+    phase.terms["c"][0] = 0.9
+    note()
+    monkeypatch.setitem(globals(), "GAIN", 0.9)
+    note()
+    type(phase).factor = 0.1
+    note()
+    assert all(not np.array_equal(one, other) for one, other in itertools.pairwise(pictures))
+    assert counts[2] == counts[1] < counts[3] < counts[4] < counts[5]
+    assert not any(pair.recordings.failures.values())
+    found, truth = pair.gradients(INSIDE + "phase_function.b", 1)
+    # As in assert_same_derivatives.
+    assert np.abs(found - truth).max() <= 72 * 3 * 2 * 3 * 2**-24 * np.abs(truth).max() > 0
+
+
+def test_python_plugins_of_other_kinds_are_recorded() -> None:
+    """A BSDF, a texture and an emitter with a parameter each."""
+
+    def own(base: type) -> type:
+        class Own(base):
+            def __init__(self, props: mi.Properties) -> None:
+                super().__init__(props)
+                self.value = mi.Float(0.6)
+                is_emitter = isinstance(self, mi.Emitter)
+                self.m_flags = +mi.EmitterFlags.DeltaPosition if is_emitter else +mi.BSDFFlags.DiffuseReflection
+                self.m_components = [self.m_flags]
+
+            def traverse(self, callback: mi.TraversalCallback) -> None:
+                callback.put("value", self.value, mi.ParamFlags.Differentiable)
+
+            def to_string(self) -> str:
+                return "Own"
+
+        return Own
+
+    class Matte(own(mi.BSDF)):
+        def sample(self, ctx: object, si: mi.SurfaceInteraction3f, _: mi.Float, two: mi.Point2f, active: mi.Bool) -> tuple:
+            drawn = dr.zeros(mi.BSDFSample3f)
+            drawn.wo, drawn.eta = mi.warp.square_to_cosine_hemisphere(two), 1.0
+            drawn.pdf, drawn.sampled_type = mi.warp.square_to_cosine_hemisphere_pdf(drawn.wo), mi.UInt32(self.m_flags)
+            return drawn, dr.select(active & (si.wi.z > 0), mi.Color3f(self.value), 0)
+
+        def eval(self, ctx: object, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> mi.Color3f:
+            return mi.Color3f(self.value) * self.pdf(ctx, si, wo, active)
+
+        def pdf(self, ctx: object, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> mi.Float:
+            return dr.select(active & (si.wi.z > 0) & (wo.z > 0), wo.z / dr.pi, 0)
+
+        def eval_pdf(self, *given: object) -> tuple:
+            return self.eval(*given), self.pdf(*given)
+
+    class Stripes(own(mi.Texture)):
+        def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Color3f:
+            return mi.Color3f(self.value * (0.5 + 0.4 * dr.sin(9 * si.uv.x)))
+
+    class Bulb(own(mi.Emitter)):
+        def sample_direction(self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True) -> tuple:
+            found, place = dr.zeros(mi.DirectionSample3f, dr.width(it.p)), mi.Point3f(1, -1, 2)
+            found.p, found.dist, found.d = place, dr.norm(place - it.p), dr.normalize(place - it.p)
+            found.pdf, found.delta, found.emitter = mi.Float(1), mi.Bool(True), mi.EmitterPtr(self)
+            return found, mi.Color3f(self.value / dr.square(found.dist))
+
+        def eval_direction(self, it: mi.Interaction3f, found: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Color3f:
+            return mi.Color3f(self.value / dr.square(found.dist))
+
+        def pdf_direction(self, it: mi.Interaction3f, found: mi.DirectionSample3f, active: mi.Bool = True) -> mi.Float:
+            return mi.Float(0)
+
+        def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Color3f:
+            return mi.Color3f(0)
+
+        def bbox(self) -> mi.ScalarBoundingBox3f:
+            return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(1, -1, 2))
+
+    mi.register_bsdf("test_matte", Matte)
+    mi.register_texture("test_stripes", Stripes)
+    mi.register_emitter("test_bulb", Bulb)
+    turn = mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(3)
+    floor = {"type": "rectangle", "to_world": turn, "bsdf": {"type": "test_matte"}}
+    ball = {"type": "sphere", "radius": 0.4, "bsdf": {"type": "diffuse", "reflectance": {"type": "test_stripes"}}}
+    pair = Pair(smoke_under(floor=floor, ball=ball, bulb={"type": "test_bulb"}), 3)
+    for call in range(2):
+        for key in ("floor.bsdf.value", "ball.bsdf.reflectance.value", "bulb.value"):
+            pair.scale(key, 0.9)
+            pair.assert_same(call)
+            found, truth = pair.gradients(key, 1)
+            # As in assert_same_derivatives.
+            assert np.abs(found - truth).max() <= 72 * 3 * 2 * 3 * 2**-24 * np.abs(truth).max() > 0
+    assert pair.recordings.count > 0 and not any(pair.recordings.failures.values())
+
+
+def test_a_python_plugin_with_a_hidden_array_is_traced() -> None:
+    """Dr.Jit fails to record it, and the images are right."""
+    hidden = dr.opaque(mi.Float, 0.9)
+
+    def eval_pdf(ctx: object, mei: mi.MediumInteraction3f, wo: mi.Vector3f, active: mi.Bool = True) -> tuple:
+        return mi.Spectrum((1 + hidden * dr.dot(mei.wi, wo)) / (4 * dr.pi)), mi.Float(1 / (4 * dr.pi))
+
+    pair = Pair(load_tilted(eval_pdf=eval_pdf)[0], 3)
+    for call in range(4):
+        pair.assert_same(call)
+    assert len(pair.recordings.failures[render_tasks.ImageTask]) == 2
+
+
+def test_a_python_plugin_that_may_change_unseen_is_named() -> None:
+    scene, _ = load_tilted(box=Unseen())
+    sentence = "Tilted is a Python plugin that reads self.box, a Unseen, which may change unseen"
+    assert find_hidden_arrays(scene, scene.sensors()[0]) == sentence
+
+    with pytest.raises(UnfollowedStateError, match="Unseen is a Python plugin of a kind whose recordings have not been tried"):
+        describe_foreign(Unseen(), ())
 
 
 def test_only_back_ends_that_were_tried_record(monkeypatch: pytest.MonkeyPatch) -> None:
