@@ -105,8 +105,8 @@ def test_shifts_and_turns_of_many_views(variant_rgb) -> None:
 @pytest.mark.slow
 def test_tilt_of_the_axis(variant_rgb) -> None:
     """A degree along the light and half a degree across it: within a sixth of a degree, and of four deviations."""
-    moves = np.tile([0, 0, 0.01], (48, 1))
-    beam, grid, y = scan(48, 24, 64, tilt=0.02, moves=moves)
+    moves = np.tile([0, 0, 0.01], (36, 1))
+    beam, grid, y = scan(36, 16, 48, tilt=0.02, moves=moves)
     found = align_views(beam, grid, y, np.ones(y.shape), ["tilt"], NONE)
     error = found.tilt[0] - [0.02, 0.01]
     assert (np.abs(error) < 0.003).all() and (np.abs(error) < 4 * found.tilt[1]).all()
@@ -212,11 +212,11 @@ def test_a_tilt_that_still_moves_is_uncertain(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.slow
 def test_deviations_of_the_axis(variant_rgb) -> None:
-    """Ellipsoids in three parallel beams and three cones: the RMS of the errors over their deviations is below 2, which true
-    normal deviations exceed in one of 1,900 sets. 23 errors of larger scans (48 views of 16 x 48 pixels) had 0.64; a quarter of
+    """Ellipsoids in two parallel beams and two cones: the RMS of the errors over their deviations is below 2, which true
+    normal deviations exceed in one of 300 sets. 23 errors of larger scans (48 views of 16 x 48 pixels) had 0.64; a quarter of
     their views had 1.79."""
     ratios = []
-    for seed in range(6):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         axis = rng.uniform(-2, 2)
         beam = ParallelBeam(np.arange(32) * np.pi / 32, (12, 32))
