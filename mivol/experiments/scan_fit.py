@@ -185,8 +185,9 @@ class ScanFit(FitKind):
         volume = fit.run.state.x.reshape(self.projector.grid.shape)
         predicted = np.zeros(self.data.y.shape, np.float32)
         predicted[self.kept] = self.problem.linear_problem.A @ volume
-        if len(self.held_out):
-            predicted[self.held_out] = self.projector.subset(self.held_out) @ volume
+        others = np.setdiff1d(np.arange(len(predicted)), self.kept)  # held-out and lost views
+        if len(others):
+            predicted[others] = self.projector.subset(others) @ volume
         write_outputs(run, predicted, self.grid, self.data, self.held_out, volume, self.settings.unit)
         if self.alignment is not None:
             moves, found = self.alignment.moves, self.alignment

@@ -160,7 +160,7 @@ def test_slices_without_a_clear_least_entropy_are_refused(variant_rgb: str) -> N
 
 
 def test_moments_follow_a_circle() -> None:
-    """Two rows of one pixel of mass each: centres of mass at 5 + cos and 5 + 2 sin; both rows say 5."""
+    """Two rows of one pixel of mass each: centres of mass at 5 + cos and 5 + 2 sin; both rows say 5, and sampling errs by .01."""
     angles = np.linspace(0, 2 * np.pi, 7)
     y = np.zeros((7, 2, 11))
     for view, angle in enumerate(angles):
@@ -168,22 +168,24 @@ def test_moments_follow_a_circle() -> None:
             low = int(centre)
             y[view, row, low], y[view, row, low + 1] = low + 1 - centre, centre - low
     found = axes.axis_from_moments(y, angles)
-    assert (found.column, found.uncertainty) == pytest.approx((5, 0), abs=1e-9)
+    assert (found.column, found.uncertainty) == pytest.approx((5, 0.01), abs=1e-9)
     y[:, 1] = np.roll(y[:, 1], 2, axis=-1)
     found = axes.axis_from_moments(y, angles)
     # Views agree and rows do not: 5 and 7 scatter by sqrt(2), and their mean by 1.
-    assert (found.column, found.uncertainty) == pytest.approx((6, 1))
+    assert (found.column, found.uncertainty) == pytest.approx((6, np.hypot(1, 0.01)))
     y[:, 1] = np.roll(y[:, 1], -2, axis=-1)
     rough = y.copy()
     rough[3] = np.roll(y[3], 1, axis=-1)
     found = axes.axis_from_moments(rough, angles)
     design = np.stack([np.ones(7), np.cos(angles), np.sin(angles)], 1)
     centres = rough @ np.arange(11)
-    each = [axes._fit_first_coefficient(design, centres[:, row]) for row in range(2)]
-    assert found.column == pytest.approx((each[0][0] + each[1][0]) / 2)
-    scatter = abs(each[0][0] - each[1][0]) / np.sqrt(2)
-    assert scatter < np.hypot(each[0][1], each[1][1]) / np.sqrt(2)
-    assert found.uncertainty == pytest.approx(np.hypot(each[0][1], each[1][1]) / 2)
+    column, scatter = axes._fit_first_coefficient(design, centres.mean(1))
+    assert (found.column, found.uncertainty) == pytest.approx((column, np.hypot(scatter, 0.01)))
+    # Air of .01 in eleven columns pulls the axis from 6 towards the middle, by .11 of the distance over a mass of 1.11.
+    bright = np.roll(y, 1, axis=-1) + 0.01
+    found = axes.axis_from_moments(bright, angles)
+    assert found.column == pytest.approx(6 - 0.11 / 1.11)
+    assert found.uncertainty == pytest.approx(np.hypot(0.01, 0.11 / 1.11 * (found.column - 5)))
     # A row beside the object has a hundredth of its mass, and does not count; nor does a row that is empty in one view.
     beside = np.concatenate([y, np.random.default_rng(0).uniform(0, 0.002, (7, 1, 11))], 1)
     assert axes.axis_from_moments(beside, angles) == axes.axis_from_moments(y, angles)
@@ -203,7 +205,28 @@ def test_less_than_half_a_turn_has_the_axis_of_moments(shift: float, variant_rgb
         assert_refused("found no rotation axis: opposite views show no mirror images", axes.find_axis, *given)
     else:
         axis = axes.find_axis(*given)
-        assert abs(axis.column - 31.0) < 5 * axis.uncertainty < 0.2 and axis.method.startswith("moments of the shadows; no")
+        assert abs(axis.column - 31.0) < 5 * axis.uncertainty < 0.2 and axis.method == "moments of the shadows"
+
+
+SHORT_ARCS = {
+    "blocks": AxisScan(0.8, radius=12.4, views=24, arc=160.0, columns=40, head=False, seed=3),
+    "head": AxisScan(-2.9, radius=14.0, views=40, arc=130.0, columns=40, rows=1, seed=2),
+    "eight rows": AxisScan(1.9, radius=25.6, views=24, arc=160.0, columns=64, head=False, rows=8, seed=3),
+    "cut off": AxisScan(-2.5, radius=52.0, views=40, arc=160.0, columns=64, depth=0.5, seed=4),
+}
+
+
+@pytest.mark.parametrize("name", SHORT_ARCS)
+def test_the_deviation_of_an_axis_of_less_than_half_a_turn(variant_rgb: str, name: str) -> None:
+    """Within three deviations, which are at most a third of a column. An object that some views cut off is refused:
+    reconstructions say 1.9 columns too much there, with a deviation of .08."""
+    scan = SHORT_ARCS[name]
+    given = (*to_line_integrals(correct_transmission(*scan.readings())), scan.beam().angles)
+    if name == "cut off":
+        assert_refused("some views do not see the whole object", axes.find_axis, *given)
+    else:
+        axis = axes.find_axis(*given)
+        assert abs(axis.column - scan.column) < 3 * axis.uncertainty < 0.33
 
 
 def test_how_far_the_object_reaches() -> None:
@@ -257,13 +280,12 @@ RULES = {
     "the mirrors'": ((7.4, 0.1), (7.0, 0.15), (7.0, 0.15, "mirrors")),
     "the mirrors' by far": ((8.4, 0.1), (7.0, 0.02), (7.0, 0.02, "mirrors; reconstructions say 8.40, which does not count")),
     "nothing refined": (None, (7.0, 0.02), (7.0, 0.02, "mirrors; no column nearby predicts half of the views best")),
-    "moments refined": ((7.4, 0.1), None, (7.4, 0.2, "halves")),
 }
 
 
 @pytest.mark.parametrize("case", RULES)
 def test_which_axis_counts(monkeypatch: pytest.MonkeyPatch, case: str) -> None:
-    """The one of the smaller deviation; moments, which stand at 7 too, serve as a start alone.
+    """The one of the smaller deviation; without mirror images an object as wide as the detector has no axis.
 
     Three columns in three directions: the bumps of the misfit add hypot(.04, .02) to the refined deviation.
     """
@@ -275,14 +297,12 @@ def test_which_axis_counts(monkeypatch: pytest.MonkeyPatch, case: str) -> None:
         return axes.Axis(*found, method)
 
     monkeypatch.setattr(axes, "axis_from_mirrors", lambda *_: answer(rough, "mirrors"))
-    monkeypatch.setattr(axes, "axis_from_moments", lambda *_: answer((7.0, 1e-9), "moments"))
     monkeypatch.setattr(axes, "axis_from_reconstructions", lambda *_: answer(fine, "halves"))
     y = np.ones((2, 1, 3))
     found = axes.find_axis(y, y, np.arange(2.0))
     assert (found.column, found.uncertainty) == pytest.approx(wanted[:2]) and found.method == wanted[2]
     monkeypatch.setattr(axes, "axis_from_mirrors", lambda *_: answer(None, ""))
-    monkeypatch.setattr(axes, "axis_from_reconstructions", lambda *_: answer(None, ""))
-    assert_refused("no column near 7 .* give scan.axis_offset, or data.find_axis = false", axes.find_axis, y, y, np.arange(2.0))
+    assert_refused("do not see the whole object .* give scan.axis_offset, or data.find_axis = false", axes.find_axis, y, y, np.arange(2.0))
 
 
 def beam_of(axis_offset: float, views: int = 60, columns: int = 48, arc: float = 360.0, **changes: object) -> ConeBeam:
