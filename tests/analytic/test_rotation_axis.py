@@ -160,7 +160,7 @@ def test_slices_without_a_clear_least_entropy_are_refused(variant_rgb: str) -> N
 
 
 def test_moments_follow_a_circle() -> None:
-    """Two rows of one pixel of mass each: centres of mass at 5 + cos and 5 + 2 sin; both rows say 5, and sampling errs by .01."""
+    """Two rows of one pixel of mass each, with centres at 5 + cos and 5 + 2 sin: both rows say 5, and sampling errs by .01."""
     angles = np.linspace(0, 2 * np.pi, 7)
     y = np.zeros((7, 2, 11))
     for view, angle in enumerate(angles):
@@ -302,7 +302,9 @@ def test_which_axis_counts(monkeypatch: pytest.MonkeyPatch, case: str) -> None:
     found = axes.find_axis(y, y, np.arange(2.0))
     assert (found.column, found.uncertainty) == pytest.approx(wanted[:2]) and found.method == wanted[2]
     monkeypatch.setattr(axes, "axis_from_mirrors", lambda *_: answer(None, ""))
-    assert_refused("do not see the whole object .* give scan.axis_offset, or data.find_axis = false", axes.find_axis, y, y, np.arange(2.0))
+    assert_refused(
+        "do not see the whole object .* give scan.axis_offset, or data.find_axis = false", axes.find_axis, y, y, np.arange(2.0)
+    )
 
 
 def beam_of(axis_offset: float, views: int = 60, columns: int = 48, arc: float = 360.0, **changes: object) -> ConeBeam:
