@@ -193,8 +193,8 @@ def read_volume(
             ``SeriesInstanceUID`` of a DICOM series; name of the slices, with "#" for numbers, in a folder of several kinds.
         frame: key of :data:`FRAMES`: "file" places the volume as in the header and refuses a degenerate box, "unit" puts the
             volume on the unit cube.
-        shape, dtype: voxels (Z, Y, X) and type of raw bytes, which have no header. Raw bytes with a header .nhdr or .mhd beside
-            them need neither.
+        shape, dtype: voxels (Z, Y, X) and type of raw bytes, which have no header. Raw bytes with a file .nhdr, .mhd or .toml
+            beside them need neither.
 
     Returns:
         Values, placement and facts. NaN, Inf and negative numbers are kept; :func:`mivol.files.check_volume` refuses them.

@@ -10,6 +10,7 @@ import logging
 import os
 import re
 import struct
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -120,25 +121,31 @@ def read_images(files: list[Path], rows: slice = ALL) -> np.ndarray:
     Raises:
         MivolError: errors of :func:`read_stack`.
     """
+    pages: list[np.ndarray] = []
+    shapes: dict[tuple[int, ...], Path] = {}
+    for file in files:
+        found = _read_pages(file, rows)
+        for page in found:
+            shapes.setdefault(page.shape, file)
+        pages += found
+    if len(shapes) > 1 or len(next(iter(shapes))) != 2:
+        other = list(shapes.values())[:2][-1]
+        raise refusal(other, f"images of shapes {sorted(shapes)[:3]}", "grey images of one size", "crop or convert them")
+    return np.stack(pages)
+
+
+def _read_pages(file: Path, rows: slice) -> list[np.ndarray]:
+    """Pages or frames (rows, columns), float32, of a file."""
     from PIL import ImageSequence
 
-    pages = []
-    for file in files:
-        check_file(file)
-        if file.suffix.lower() in DETECTOR_IMAGES:
-            pages += list(_read_detector_images(file)[:, rows])
-            continue
-        if rows != ALL and (mapped := _map_pages(file)) is not None:
-            # A copy, so that the file is not mapped any more: the pages of many mapped files count as memory of the process.
-            pages += list(np.array(mapped[:, rows], np.float32))
-            del mapped
-            continue
-        with _opened(file) as image:
-            pages += [np.asarray(page, np.float32)[rows] for page in ImageSequence.Iterator(image)]
-    shapes = {page.shape for page in pages}
-    if len(shapes) > 1 or len(next(iter(shapes))) != 2:
-        raise refusal(files[0], f"images of shapes {sorted(shapes)[:3]}", "grey images of one size", "crop or convert them")
-    return np.stack(pages)
+    check_file(file)
+    if file.suffix.lower() in DETECTOR_IMAGES:
+        return list(_read_detector_images(file)[:, rows])
+    if rows != ALL and (mapped := _map_pages(file)) is not None:
+        # A copy, so that the file is not mapped any more: the pages of many mapped files count as memory of the process.
+        return list(np.array(mapped[:, rows], np.float32))
+    with _opened(file) as image:
+        return [np.asarray(page, np.float32)[rows] for page in ImageSequence.Iterator(image)]
 
 
 MOST_AXES = 9
@@ -268,8 +275,10 @@ def _opened(file: Path) -> Iterator[Any]:
     from PIL import Image
 
     try:
-        with Image.open(file) as image:
-            yield image
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what is truncated is refused below
+            with Image.open(file) as image:
+                yield image
     except Exception as error:  # Pillow raises errors of its parser, such as a TypeError without a width
         raise refusal(file, f"a damaged or foreign file ({error})", "TIFF", "copy the file again") from error
 

@@ -290,7 +290,14 @@ def _exchange(file: Any, path: Path, group: str, names: Mapping[str, str]) -> _S
         if role not in names and (role == "data" or has_link(file, f"{group}/{part}"))
     }
     angles = found.pop("angles", None)
-    return _Scan("data-exchange", group, found, angles)
+    objective = file[OBJECTIVE] if is_group(file, OBJECTIVE) else None
+    edge = _length(objective, "resolution", "um")
+    notes = _describe_unit(objective, "resolution", "micrometres, as Data Exchange has them")
+    return _Scan("data-exchange", group, found, angles, tuple(notes), edge and (edge, edge))
+
+
+OBJECTIVE = "measurement/instrument/detection_system/objective"
+"""Group of Data Exchange whose ``resolution`` is the edge of a pixel at the sample."""
 
 
 def _nxtomo(file: Any, path: Path, entry: str, names: Mapping[str, str]) -> _Scan:
@@ -396,24 +403,24 @@ def _first_detector(file: Any, entry: str) -> Any:
     return next((instrument[n] for n in instrument if is_group(instrument, n) and "x_pixel_size" in instrument[n]), None)
 
 
-def _length(holder: Any, name: str) -> float | None:
-    """A length [mm]; None if absent, or of an unknown unit."""
+def _length(holder: Any, name: str, usual: str = "m") -> float | None:
+    """A length [mm], in the unit ``usual`` if it names none; None if absent, or of an unknown unit."""
     if holder is None or name not in holder:
         return None
     item = holder[name]
-    factor = LENGTHS.get(to_text(item.attrs.get("units", "m")).strip().lower())
+    factor = LENGTHS.get(to_text(item.attrs.get("units", usual)).strip().lower())
     value = np.asarray(item, np.float64).ravel() if factor and np.issubdtype(item.dtype, np.number) else np.empty(0)
     return float(value[0] * factor) if value.size and np.isfinite(value[0]) and value[0] else None
 
 
-def _describe_unit(holder: Any, name: str) -> list[str]:
+def _describe_unit(holder: Any, name: str, usual: str = "metres, as NeXus has them") -> list[str]:
     """What is assumed of a length without a unit, and that a length of an unknown unit is not read."""
     if holder is None or name not in holder:
         return []
     unit = to_text(holder[name].attrs.get("units", "")).strip()
     if unit and unit.lower() not in LENGTHS:
         return [f"{name} is in {unit!r}, which is no known unit of length: it is not read; scan.pitch sets it"]
-    return [] if unit else [f"{name} has no unit and is taken as metres, as NeXus has them; scan.pitch sets it"]
+    return [] if unit else [f"{name} has no unit and is taken as {usual}; scan.pitch sets it"]
 
 
 def _dataset(file: Any, path: Path, group: str, name: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 import weakref
 from pathlib import Path
 
@@ -235,6 +236,19 @@ def test_headers_of_edf_without_an_angle(tmp_path: Path) -> None:
 def test_angles_of_an_mdoc_without_angles_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.mdoc").write_text("[ZValue = 0]\nStage = 3\n")
     assert_refused("found 1 sections ZValue, expected a number TiltAngle in each", read_tilt_angles, tmp_path / "a.mdoc")
+
+
+def test_a_broken_image_among_others_is_named(tmp_path: Path) -> None:
+    """One of another size; one that is truncated, of which Pillow would warn besides."""
+    tifffile = pytest.importorskip("tifffile")
+    for view in range(3):
+        tifffile.imwrite(tmp_path / f"view_{view}.tif", np.zeros((8, 6 + (view == 1)), np.float32), photometric="minisblack")
+    assert_refused(r"view_1\.tif: found images of shapes \[\(8, 6\), \(8, 7\)\]", read_stack, tmp_path / "view_*.tif")
+    (tmp_path / "view_1.tif").write_bytes((tmp_path / "view_2.tif").read_bytes()[:200])
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        assert_refused(r"view_1\.tif: found a damaged or foreign file", read_stack, tmp_path / "view_*.tif")
+    assert said == []
 
 
 def test_a_file_is_unmapped_before_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -65,6 +65,23 @@ def test_units_of_a_pixel_are_read_or_said(tmp_path: Path, unit: str, pitch: flo
     assert scan.angles[1] == pytest.approx(np.radians(36))
 
 
+@pytest.mark.parametrize(("unit", "pitch", "note"), [("microns", 0.00117, None), (None, 0.00117, "taken as micrometres")])
+def test_the_resolution_of_the_objective_is_the_pixel(tmp_path: Path, unit: str | None, pitch: float, note: str | None) -> None:
+    """In Data Exchange, as an array of one number; without it the size is unknown."""
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        for name, frames in (("data", VIEWS), ("data_white", FLATS)):
+            file[f"exchange/{name}"] = FRAMES[frames]
+    assert survey_projections(path, "", None, None).pitch is None
+    with h5py.File(path, "a") as file:
+        item = file.create_dataset("measurement/instrument/detection_system/objective/resolution", data=[1.17])
+        if unit:
+            item.attrs["units"] = unit
+    found = survey_projections(path, "", None, None)
+    assert found.pitch == pytest.approx((pitch, pitch))
+    assert any(note in line for line in found.notes) if note else found.notes == ()
+
+
 def test_the_first_of_several_scans_is_read(tmp_path: Path) -> None:
     """And the sentence names the others; GDA's entry lies in another entry."""
     path = write_nxtomo(write_nxtomo(tmp_path / "a.nxs", "entry1/tomo_entry"), "entry0000", angles=DEGREES + 1)
