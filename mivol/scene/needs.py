@@ -454,6 +454,10 @@ class Needs(ShapeFacts):
             return None
         return replace(self, lamp_noise=None, branch_noise=None, mirror_noise=None, **_sort_parameters(differentiated))
 
+    def follow_shapes(self, boundaries: tuple[Boundary, ...], facts: ShapeFacts) -> Needs:
+        """The same facts of the same shapes in other places."""
+        return replace(self, boundaries=boundaries, surface_boxes=facts.surface_boxes, lit_box=facts.lit_box)
+
     def with_views(self, survey: SceneSurvey, phases: list[Phase]) -> Needs:
         """The same facts with the media viewed anew: a recording reads their arrays from the scene, all but ``phases``."""
         views = (b.view(survey.grids, phase) for b, phase in zip(self.boundaries, phases, strict=True))
@@ -478,6 +482,7 @@ class Needs(ShapeFacts):
             stops_rays=self.stops_rays,
             surface_boxes=self.surface_boxes,
             tracer=tracer,
+            lit_box=self.lit_box,
         )
 
 

@@ -63,7 +63,6 @@ from mivol.scene.survey import SceneSurvey
 from mivol.transport.estimators.flights.flight_derivatives import MIN_ALBEDO
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.lighting.emission_sampling import EmissionSampling, EmissionTable
-from mivol.transport.estimators.lighting.emitters import find_lit_box
 from mivol.transport.estimators.lighting.tabulated_shadows import TransmittanceGrid
 from mivol.transport.estimators.single_scattering.near_light import NearLighting
 from mivol.transport.estimators.single_scattering.single_scattering import PROBE_DEPTH
@@ -449,7 +448,7 @@ def build_estimators(
         direct.emitters  # noqa: B018  (made now, not in the loop of a path)
     if for_images and plan.shadow_nodes:
         with dr.suspend_grad():
-            direct.shadow_table = TransmittanceGrid.over_box(media, direct.emitters, find_lit_box(scene), plan.shadow_nodes)
+            direct.shadow_table = TransmittanceGrid.over_box(media, direct.emitters, needs.lit_box, plan.shadow_nodes)
     lobe = None if plan.side_flight_cosine is None else dr.opaque(mi.Float, plan.side_flight_cosine)
     emission = _make_emission_sampling(scene, media, needs) if plan.draws_emission else None
     long_paths_count = is_even or any(medium.emits for medium in needs.media)

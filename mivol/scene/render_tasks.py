@@ -22,8 +22,10 @@ from mivol.scene.plan import Plan, Readings, build_estimators
 from mivol.scene.scene_state import SceneState, find_hidden_arrays
 from mivol.scene.survey import SceneSurvey
 from mivol.space import lattice_from_world
+from mivol.transport.estimators.lighting.tabulated_shadows import place_nodes
 from mivol.transport.estimators.scores import Primal, Replay, Tangent
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
+from mivol.transport.media.body import cuts_grids
 from mivol.transport.media.extinction import to_components
 from mivol.transport.media.phases import Phase, read_phase
 from mivol.transport.path.derivatives import carry_tangents, prepare_derivatives, replay_branches
@@ -78,9 +80,9 @@ class PlannedScene:
         plan: choices for the scene.
         arrays: arrays made for the plan.
         settings: of the integrator, for this purpose.
-        places: where groups of numbers are in ``arrays.placements`` (:func:`prepare_placements`).
+        layout: of ``arrays.placements``.
         unrecorded: why renders are not recorded; None if they are.
-        image_needs: facts of the image from which derivatives were planned; None if they were found for the derivatives.
+        image_plan: plan of the image from which derivatives were planned; None if they were planned by themselves.
     """
 
     state: SceneState
@@ -90,9 +92,9 @@ class PlannedScene:
     plan: Plan
     arrays: PreparedArrays
     settings: Settings
-    places: dict[bytes, int]
+    layout: PlacementLayout
     unrecorded: str | None = None
-    image_needs: Needs | None = None
+    image_plan: Plan | None = None
 
     def read_arrays(self) -> PreparedArrays:
         """The arrays of the next call. The derivatives of a phase function belong to one step, so they are not kept."""
@@ -111,28 +113,50 @@ class PlannedScene:
     def key(self) -> tuple:
         """All that a recording depends on and does not follow."""
         are_far = tuple(map(math.isinf, self.needs.emitter_distances))
-        return (*self.plan.decisions, self.needs.camera_inside, are_far, *self.state.key)
+        return (*self.plan.decisions, self.needs.camera_inside, are_far, self.layout.key, *self.state.key)
 
 
-def prepare_placements(needs: Needs, size: float) -> tuple[mi.Float64 | None, dict[bytes, int]]:
+@dataclass
+class PlacementLayout:
+    """Where groups of numbers are in the array of :func:`prepare_placements`.
+
+    Attributes:
+        places: index of the first number of each group, by the bytes of the group.
+        key: all places that a recording does not follow: those of grids, and of all else among media that emit. Also what the
+            host decides by places: which groups are equal, which boundaries cut grids, and the nodes of the table of shadows.
+    """
+
+    places: dict[bytes, int] = field(default_factory=dict)
+    key: tuple = ()
+
+
+def prepare_placements(needs: Needs, size: float, shadow_nodes: int) -> tuple[mi.Float64 | None, PlacementLayout]:
     """The numbers of boxes, grids and surfaces as one array, for :func:`mivol.transport.traversal.box.with_placements`.
 
     Args:
         needs: facts with the views of the media.
         size: size of the scene [length].
+        shadow_nodes: nodes along an edge of the table of shadows; 0 without a table.
     """
     if is_recording():
-        return None, {}
-    groups = [np.array([size], np.float64)]
-    for boundary, view in zip(needs.boundaries, needs.views, strict=True):
-        groups += [box.from_world for box in (boundary.box, boundary.hole) if box is not None]
-        groups += [np.array([boundary.box.edge])] if boundary.box is not None else []
+        return None, PlacementLayout()
+    groups = [np.array([size], np.float64), needs.lit_box]
+    nodes, box = place_nodes(needs.lit_box, shadow_nodes)
+    groups += [box.from_world, box.to_world[:3]] if shadow_nodes else []
+    boxes, holes, grids = [b.box for b in needs.boundaries], [b.hole for b in needs.boundaries], []
+    for box, hole, view in zip(boxes, holes, needs.views, strict=True):
+        groups += [one.from_world for one in (box, hole) if one is not None]
+        groups += [np.array([box.edge])] if box is not None else []
         lattices = (part.lattice for part in view.parts if part.lattice is not None)
-        groups += [lattice_from_world(lattice.to_world, lattice.res) for lattice in lattices if lattice.to_world is not None]
-    groups += needs.surface_boxes or ()
+        grids += [lattice_from_world(lattice.to_world, lattice.res) for lattice in lattices if lattice.to_world is not None]
+    groups += [*(needs.surface_boxes or ()), *grids]
     firsts = np.cumsum([0, *(group.size for group in groups)])
     numbers = copy_aligned(np.concatenate([group.ravel() for group in groups]))
-    return mi.Float64(numbers), {group.tobytes(): int(k) for group, k in zip(groups[::-1], firsts[-2::-1], strict=True)}
+    places = {group.tobytes(): int(k) for group, k in zip(groups[::-1], firsts[-2::-1], strict=True)}
+    kept = groups if any(view.emits for view in needs.views) else grids
+    key = (*(places[group.tobytes()] for group in groups), *map(cuts_grids, needs.views, boxes, holes), *nodes)
+    key += tuple(group.tobytes() for group in kept)
+    return mi.Float64(numbers), PlacementLayout(places, key)
 
 
 def find_unrecorded(scene: mi.Scene, sensor: mi.Sensor, spp: int, needs: Needs, plan: Plan, for_images: bool) -> str | None:
@@ -158,7 +182,7 @@ class RenderTask(RecordedTask):
         super().__init__()
         self.survey, self.needs, self.plan = opened.survey, opened.needs, opened.plan
         self.spp, self.settings, self.aovs, self.for_images = opened.spp, opened.settings, aovs, for_images
-        self.places = opened.places
+        self.places = opened.layout.places
 
     def build_estimators(self, scene: mi.Scene, arrays: PreparedArrays) -> Estimators:
         """Build the planned estimators over the arrays of the scene."""

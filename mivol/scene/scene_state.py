@@ -27,6 +27,12 @@ FOLLOWED = ("data", "value")
 PLACES = ("position", "to_world")
 """Names of the parameters that place an emitter."""
 
+SHAPE_PLACES = ("to_world", "vertex_positions", "vertex_normals", "vertex_texcoords")
+"""Names of the parameters that place a shape."""
+
+PLACED_SHAPES = ("Sphere", "Disk", "Cylinder", "Rectangle")
+"""Classes of the shapes besides meshes whose places a recording follows."""
+
 RECORDED_BACK_ENDS = ("llvm",)
 """Back ends on which renders are recorded. On a GPU, Dr.Jit 1.5 reads the handle of a hardware texture from memory that other
 textures leave uninitialised, and aborts the process; nobody has tried recordings there."""
@@ -45,7 +51,7 @@ class SceneState:
         values: the arrays that a recording follows, by their indices in Dr.Jit and with their shapes.
         others: all other arrays and numbers.
         of_sensor: the arrays and numbers of the sensor among both.
-        lamps: the places of the emitters among both.
+        lamps, shapes: the places of the emitters, and those of shapes that a recording follows, among both.
         held: the arrays. Dr.Jit would give the index of a freed array to another array.
         differentiated: keys of the scene's parameters with gradients enabled, with their owners.
     """
@@ -55,6 +61,7 @@ class SceneState:
     others: list = field(default_factory=list)
     of_sensor: list = field(default_factory=list)
     lamps: list = field(default_factory=list)
+    shapes: list = field(default_factory=list)
     held: list = field(default_factory=list)
     differentiated: list[tuple[str, mi.Object]] = field(default_factory=list)
 
@@ -120,8 +127,8 @@ class SceneState:
             is_followed, kept = _is_followed(params, key), dr.detach(numbers)
             indices = tuple(dr.detail.collect_indices(kept))
             known = before[len(self.values)][0] if is_followed and len(self.values) < len(before) else indices
-            if indices != known and kept.state == dr.VarState.Literal:
-                dr.make_opaque(numbers)
+            if indices != known and kept.state in (dr.VarState.Literal, dr.VarState.Mixed):
+                dr.make_opaque(value)  # a transform with its inverse
                 kept = dr.detach(numbers)
                 indices = tuple(dr.detail.collect_indices(kept))
             self.held.append(kept)
@@ -129,6 +136,8 @@ class SceneState:
             self._sort(owner, is_followed, state)
             if isinstance(owner, mi.Emitter) and key.rpartition(".")[2] in PLACES:
                 self.lamps.append(indices)
+            if is_followed and isinstance(owner, mi.Shape) and key.rpartition(".")[2] in SHAPE_PLACES:
+                self.shapes.append(indices)
             if state[2]:
                 differentiated.append((key, owner))
                 attached.append(numbers)
@@ -200,7 +209,7 @@ def _is_followed(params: mi.SceneParameters, key: str) -> bool:
     if isinstance(owner, mi.BSDF | mi.Emitter):
         return True
     if isinstance(owner, mi.Shape):
-        return is_painted(name)
+        return is_painted(name) or (name in SHAPE_PLACES and (owner.is_mesh() or owner.class_name() in PLACED_SHAPES))
     return isinstance(owner, mi.Sensor) and owner.class_name() in ARRAYS
 
 

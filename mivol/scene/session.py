@@ -272,11 +272,19 @@ class Session:
                 self.recordings.call(JoiningTask, (), JoiningTask, scene, tracer, dr.opaque(mi.UInt32, 0))
 
     def _survey(self, scene: mi.Scene, state: SceneState) -> _SurveyedScene:
-        """Survey a new scene, or a scene with a moved boundary."""
+        """Survey a new scene, or follow the shapes of a known one."""
         parts, kept = [*scene.shapes(), *scene.emitters()], self._surveyed
-        # What places boundaries is among the parameters whose values no recording follows.
-        is_unmoved = any(opened.state.others == state.others for opened in self._opened.values())
-        if kept is None or not kept.is_of(parts) or not (is_unmoved or kept.survey.is_current):
+        moved = None
+        if kept is not None and kept.is_of(parts):
+            # One of the two may be of an earlier place.
+            now = [opened.state for opened in self._opened.values() if opened.survey is kept.survey]
+            alike = [known for known in now if known.others == state.others]
+            if any(known.shapes == state.shapes for known in alike) or kept.survey.is_current:
+                return kept
+            moved = kept.survey.follow_shapes(scene) if alike else None
+        if moved is not None:
+            kept.survey = moved
+        else:
             self._surveyed = _SurveyedScene(parts, survey_scene(scene))
             self._opened, self._stand_ins = {}, {}
             self.recordings.clear()
@@ -305,28 +313,35 @@ class Session:
         # The table of the light of media is made with the facts.
         if known is None or not known.is_like(state, spp) or any(m.emits for m in known.needs.media):
             return None
-        needs, boundaries = known.needs, known.needs.boundaries
-        with with_placements(known.arrays.placements, known.places):
+        needs, arrays, has_moved = known.needs, known.arrays, survey is not known.survey
+        if has_moved:
+            boundaries = (*survey.boundaries, *needs.boundaries[len(known.survey.boundaries) :])
+            needs = needs.follow_shapes(boundaries, survey.facts)
+        boundaries = needs.boundaries
+        with with_placements(arrays.placements, known.layout.places):
             views = tuple(b.view(survey.grids) for b in boundaries)
             media = read_media(boundaries, views, survey)
             is_inside = may_camera_be_inside(scene, sensor, survey)
         if is_inside != needs.camera_inside or [plan_key(m) for m in media] != [plan_key(m) for m in needs.media]:
             return None
-        balls = known.arrays.balls
-        if state.lamps != known.state.lamps:
+        if has_moved or state.lamps != known.state.lamps:
             distances = find_emitter_distances(scene, boundaries, media)
             if list(map(distance_class, distances)) != list(map(distance_class, needs.emitter_distances)):
                 return None
-            balls = read_balls(scene)
-        readings = read_parts(replace(needs, views=views), known.plan, survey, for_images)
+            arrays = replace(arrays, balls=read_balls(scene))
+        viewed, layout = replace(needs, views=views), known.layout
+        if has_moved:
+            placements, layout = prepare_placements(viewed, survey.size, known.plan.shadow_nodes)
+            arrays = replace(arrays, placements=placements, tracer=survey.usable_tracer)
+        arrays = replace(arrays, readings=read_parts(viewed, known.plan, survey, for_images))
         self._views = views if for_images else ()
-        return replace(known, state=state, arrays=replace(known.arrays, readings=readings, balls=balls))
+        return replace(known, state=state, survey=survey, needs=needs, arrays=arrays, layout=layout)
 
     def _plan(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, state: SceneState, for_images: bool) -> PlannedScene:
         """Find the needs, plan, and read values."""
         survey = self._surveyed.survey
         known = next(iter(self._opened.values()), None)
-        with with_placements(None if known is None else known.arrays.placements, {} if known is None else known.places):
+        with with_placements(None if known is None else known.arrays.placements, {} if known is None else known.layout.places):
             needs = find_needs(scene, sensor, survey, spp, self.settings.may_draw_emission, state.differentiated)
         settings = settings_for(self.settings, needs, for_images)
         warn_of_misplaced_grids(needs, survey)
@@ -338,15 +353,15 @@ class Session:
         if not self.is_depth_given:
             warn_of_last_order(scene, sensor, needs, plan, survey, settings)
         light = None if needs.media_light is None else (needs.media_light.density, needs.media_light.cumulative)
-        if not is_recording() and known is not None and known.state.others == state.others:
-            placements, places = known.arrays.placements, known.places
+        if not is_recording() and known is not None and known.survey is survey and known.state.others == state.others:
+            placements, layout = known.arrays.placements, known.layout
         else:
-            placements, places = prepare_placements(needs, survey.size)
+            placements, layout = prepare_placements(needs, survey.size, plan.shadow_nodes)
         readings, balls = read_parts(needs, plan, survey, for_images), None if is_recording() else read_balls(scene)
         arrays = PreparedArrays(readings, light, find_batch_views(sensor), placements, survey.usable_tracer, balls)
         self._views = needs.views if for_images and not is_recording() else ()
         facts = replace(needs, views=(), media_light=None)
-        opened = PlannedScene(state, spp, survey, facts, plan, arrays, settings, places)
+        opened = PlannedScene(state, spp, survey, facts, plan, arrays, settings, layout)
         return self._find_unrecorded(opened, scene, for_images)
 
     def _open_like_image(
@@ -360,8 +375,9 @@ class Session:
         image, known = self._opened.get(True), self._opened.get(False)
         if image is None or image.spp != spp or not image.state.has_same_numbers(state):
             return None
-        if known is not None and known.image_needs is image.needs and known.is_like(state, spp):
-            return replace(known, state=state, arrays=image.arrays)
+        if known is not None and known.image_plan is image.plan and known.is_like(state, spp):
+            needs = known.needs.follow_shapes(image.needs.boundaries, image.needs)
+            return replace(known, state=state, survey=image.survey, needs=needs, arrays=image.arrays, layout=image.layout)
         needs = image.needs.with_parameters(state.differentiated)
         if needs is None:
             return None
@@ -369,8 +385,8 @@ class Session:
         plan = make_plan(replace(needs, views=views), settings, self.aovs)
         if plan.readings(for_images=False) != image.plan.readings(for_images=True):
             return None
-        made = image.survey, needs, plan, image.arrays, settings, image.places
-        opened = PlannedScene(state, spp, *made, image_needs=image.needs)
+        made = image.survey, needs, plan, image.arrays, settings, image.layout
+        opened = PlannedScene(state, spp, *made, image_plan=image.plan)
         return self._find_unrecorded(opened, scene, for_images=False)
 
     def _find_unrecorded(self, opened: PlannedScene, scene: mi.Scene, for_images: bool) -> PlannedScene:

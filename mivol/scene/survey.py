@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -13,7 +13,7 @@ from mivol.errors import MivolError
 from mivol.kernel_recording import RecordedFunctions, is_recording
 from mivol.scene.nesting import OrientedBox, find_nesting_fault, oriented_box, scene_diagonal, shape_bounds
 from mivol.scene_graph import traverse
-from mivol.transport.estimators.lighting.emitters import UNIFORM_EMITTER
+from mivol.transport.estimators.lighting.emitters import UNIFORM_EMITTER, find_lit_box
 from mivol.transport.media.body import Body
 from mivol.transport.media.medium_view import MediumView, nested_field, view_medium
 from mivol.transport.media.phases import Phase
@@ -85,8 +85,11 @@ class ShapeFacts:
             and hittable by paths. Emitter sampling then finds no light from inside a medium.
         stops_rays: whether every traced boundary of a medium stops or turns all rays, so that a segment stays in one medium.
         has_glass: whether a surface is smooth glass, and every surface that only mirrors and transmits is.
+        flipped: whether the normals of each shape are flipped, as by a mirrored transform.
         surface_boxes: (3, 4) maps from the world to cubes [-1, 1]^3 around the ``surfaces``; None for many surfaces, or with a
             traced boundary of a medium.
+        lit_box: corners (2, 3) of the box around the boundaries of media [length]
+            (:func:`mivol.transport.estimators.lighting.emitters.find_lit_box`).
     """
 
     surfaces: tuple[str, ...] = ()
@@ -98,7 +101,15 @@ class ShapeFacts:
     is_sealed: bool = False
     stops_rays: bool = False
     has_glass: bool = False
+    flipped: tuple[bool, ...] = ()
     surface_boxes: tuple[np.ndarray, ...] | None = None
+    lit_box: np.ndarray | None = None
+
+    @property
+    def structure(self) -> tuple:
+        """All but the places of shapes: facts with the same structure have the same plan."""
+        placed = {"surface_boxes": self.surface_boxes and len(self.surface_boxes), "lit_box": None}
+        return tuple(({name.name: getattr(self, name.name) for name in fields(ShapeFacts)} | placed).values())
 
 
 @dataclass
@@ -108,7 +119,7 @@ class SceneSurvey:
     Attributes:
         boundaries: the media with their boundaries.
         facts: the facts about shapes and emitters.
-        marks: placement of each boundary, and of each surface with a box: the array of its vertices, or its box.
+        marks: placement of each boundary, and of each surface with a box: the array of its vertices, its matrix, or its box.
         size: diagonal of the box around all shapes [length].
         tracer: scene of the surfaces and traced boundaries alone; None to trace the whole scene.
         scatters: whether each medium scattered at the last reading, by name.
@@ -164,15 +175,39 @@ class SceneSurvey:
         """Whether no boundary has moved since the survey. While ``dr.freeze`` records, placements cannot be read and count as
         unmoved.
         """
-        return is_recording() or all(_is_unmoved(shape, mark) for shape, mark in self.marks)
+        return is_recording() or not self._find_moved()
+
+    def _find_moved(self) -> set[int]:
+        """Pointers of the shapes that have moved since the survey."""
+        return {shape.ptr for shape, mark in self.marks if not _is_unmoved(shape, mark)}
+
+    def follow_shapes(self, scene: mi.Scene) -> SceneSurvey | None:
+        """The survey of the same scene whose shapes have moved, with all that was read of values so far; None if more than
+        places has changed.
+
+        Raises:
+            MivolError: boundaries that disagree about the medium between them.
+        """
+        now = survey_scene(scene, self)
+        if now.facts.structure != self.facts.structure or len(now.boundaries) != len(self.boundaries):
+            return None
+        if any(a.structure != b.structure for a, b in zip(now.boundaries, self.boundaries, strict=True)):
+            return None
+        placed = {name: getattr(now, name) for name in ("boundaries", "facts", "marks", "size", "tracer")}
+        return replace(self, misplaced={}, **placed)
 
 
-def survey_scene(scene: mi.Scene) -> SceneSurvey:
+def survey_scene(scene: mi.Scene, before: SceneSurvey | None = None) -> SceneSurvey:
     """Find the media, surfaces and emitters of a scene.
+
+    Args:
+        scene: the scene.
+        before: a survey of the same shapes, some of which may have moved since.
 
     Raises:
         MivolError: boundaries that disagree about the medium between them.
     """
+    moved = None if before is None else before._find_moved()
     boundaries, surfaces, refractive, has_null = [], [], [], False
     shapes = scene.shapes()
     boxes = {s.ptr: oriented_box(s) for s in shapes if s.is_medium_transition()}
@@ -193,7 +228,8 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     boundaries = [replace(b, box=None) if b.medium.ptr in traced else b for b in boundaries]
     boxed = {b.medium.ptr for b in boundaries if b.box is not None}
     edges = [s for s in shapes if s.is_medium_transition() and not (s.interior_medium() and s.interior_medium().ptr in boxed)]
-    fault = None if is_recording() else find_nesting_fault(scene, edges)
+    is_checked = moved is not None and not any(s.is_medium_transition() and s.ptr in moved for s in shapes)
+    fault = None if is_recording() or is_checked else find_nesting_fault(scene, edges)
     if fault is not None:
         raise MivolError(fault)
     around = find_outside_media([o for o in traverse(scene).hierarchy if isinstance(o, mi.Medium)], boundaries)
@@ -204,7 +240,11 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     # A GPU traces rays in hardware.
     follows = mi.variant().startswith("llvm") and 0 < len(solid) <= MAX_FOLLOWED_SURFACES and not is_recording()
     # Mitsuba cannot put an instance into another scene.
-    tracer = _make_tracer(solid) if follows and boxed and not any(is_instance(s) for s in solid) else None
+    is_traced_alone = follows and boxed and not any(is_instance(s) for s in solid)
+    if moved is not None and not any(s.ptr in moved for s in solid):
+        tracer = before.tracer
+    else:
+        tracer = _make_tracer(solid) if is_traced_alone else None
     # Inside of a traced boundary, every ray meets its box.
     has_boxes = follows and all(b.box or b.shape == OUTSIDE_SHAPES for b in boundaries)
     pieces = tuple(rows for s in solid for rows in _surface_boxes(s)) if has_boxes else ()
@@ -220,7 +260,9 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
         is_sealed=_are_sealed(boundaries, shapes, scene.emitters()),
         has_glass=_has_glass(surfaces),
         stops_rays=not has_null and not any(_is_bare(edge) for edge in edges),
+        flipped=tuple(shape.has_flipped_normals() for shape in shapes),
         surface_boxes=pieces if 0 < len(pieces) <= MAX_SURFACE_BOXES else None,
+        lit_box=find_lit_box(scene),
     )
     return SceneSurvey(tuple(boundaries), facts, marks, scene_diagonal(scene), tracer)
 
@@ -237,12 +279,12 @@ def _find_endless_media(boundaries: Sequence[Boundary], shapes: Sequence[mi.Shap
 
 
 def _read_placement(shape: mi.Shape) -> object:
-    """The placement of a shape: the array of a mesh's vertices, else the bounding box."""
+    """The placement of a shape: the array of a mesh's vertices, else the matrix or the bounding box."""
     params = traverse(shape)
     # A rectangle is a mesh, but does not expose its vertices.
     if "vertex_positions" in params:
         return dr.detach(params["vertex_positions"])
-    return [*shape.bbox().min, *shape.bbox().max]
+    return dr.detach(params["to_world"].matrix) if "to_world" in params else [*shape.bbox().min, *shape.bbox().max]
 
 
 def _has_glass(surfaces: Sequence[mi.Shape]) -> bool:
@@ -313,7 +355,7 @@ def _map_to_cube(points: np.ndarray) -> np.ndarray:
 
 def _is_unmoved(shape: mi.Shape, mark: object) -> bool:
     now = _read_placement(shape)
-    return now == mark if isinstance(mark, list) else now.index == mark.index
+    return now == mark if isinstance(mark, list) else dr.detail.collect_indices(now) == dr.detail.collect_indices(mark)
 
 
 def _emitter_kind(emitter: mi.Emitter) -> str:
@@ -430,6 +472,12 @@ class Boundary:
     level: int = 0
     hole: Box | None = None
     around: OrientedBox | None = None
+
+    @property
+    def structure(self) -> tuple:
+        """All but the place of the boundary."""
+        box = None if self.box is None else self.box.is_round
+        return self.medium.ptr, self.name, self.shape, box, self.level, self.hole is None, self.around is None
 
     def view(self, grids: StockGrids, phase: Phase | None = None) -> MediumView:
         """View the medium as a sum of fields; arguments as in :func:`mivol.transport.media.medium_view.view_medium`.

@@ -67,12 +67,17 @@ def fire() -> mi.Scene:
     return close_up({"smoke": box_of(smoke | {"emission_density": light}, PLACE)}, res=6)
 
 
+def lit_by_map() -> dict:
+    """An environment map."""
+    colours = np.random.default_rng(1).uniform(0.1, 1.0, (8, 16, 3)).astype(np.float32)
+    return {"type": "envmap", "bitmap": mi.Bitmap(colours)}
+
+
 def lit_by_maps() -> mi.Scene:
     """Under an environment map and a spot."""
-    colours = np.random.default_rng(1).uniform(0.1, 1.0, (8, 16, 3)).astype(np.float32)
     above = mi.ScalarTransform4f().look_at([2, -2, 3], [0, 0, 0], [0, 0, 1])
     spot = {"type": "spot", "to_world": above, "intensity": 20.0, "cutoff_angle": 14.0, "beam_width": 7.0}
-    return smoke_under(sky={"type": "envmap", "bitmap": mi.Bitmap(colours)}, spot=spot)
+    return smoke_under(sky=lit_by_map(), spot=spot)
 
 
 def before_painted_faces() -> mi.Scene:
@@ -438,6 +443,144 @@ def test_the_place_of_an_emitter_is_followed(name: str) -> None:
         if x == 1.2:
             count = pair.recordings.count
     assert len(sums) == 4 and pair.recordings.count == count and not any(pair.recordings.failures.values())
+
+
+def among_shapes(**more: dict) -> mi.Scene:
+    """Smoke between a floor, a ball, a block and a lamp."""
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.5]).scale(3)}
+    above = mi.ScalarTransform4f().look_at([0.5, -1, 3], [0, 0, 0], [0, 1, 0]).scale(0.5)
+    lamp = {"type": "rectangle", "to_world": above, "emitter": {"type": "area", "radiance": 9.0}}
+    ball = {"type": "sphere", "center": [-1.5, 0, 0], "radius": 0.3}
+    block = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([1.6, 0, 0]).scale(0.3)}
+    return smoke_under(**({"floor": floor, "lamp": lamp, "ball": ball, "block": block} | more))
+
+
+def fog_in(shape: dict, **more: dict) -> mi.Scene:
+    """A homogeneous medium over a floor, under a sky and a lamp."""
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.5]).scale(3)}
+    fog = shape | {"bsdf": {"type": "null"}, "interior": medium("homogeneous", 1.5, 0.8)} | more
+    return close_up({"smoke": fog, "floor": floor, "lamp": point((0.2, 0.1, 5.0))[0]}, res=6)
+
+
+MOVED_SHAPES: dict[str, tuple[Callable[[], mi.Scene], str, str]] = {
+    "floor": (among_shapes, "floor.to_world", INSIDE + "sigma_t.data"),
+    "lamp": (among_shapes, "lamp.to_world", INSIDE + "albedo.value.value"),
+    "ball": (among_shapes, "ball.to_world", INSIDE + "sigma_t.data"),
+    "block": (among_shapes, "block.vertex_positions", "lamp.emitter.radiance.value"),
+    "block in the sun": (lambda: among_shapes(lamp=lit_by_map()), "block.vertex_positions", INSIDE + "sigma_t.data"),
+    "box of fog": (lambda: fog_in({"type": "cube"}), "smoke.vertex_positions", INSIDE + "sigma_t.value.value"),
+    "ball of fog": (lambda: fog_in({"type": "sphere"}), "smoke.to_world", INSIDE + "albedo.value.value"),
+    "box of glass": (
+        lambda: fog_in({"type": "cube"}, bsdf={"type": "thindielectric"}),
+        "smoke.vertex_positions",
+        INSIDE + "sigma_t.value.value",
+    ),
+    "box of a grid": (smoke_under, "smoke.vertex_positions", INSIDE + "sigma_t.data"),
+}
+"""A scene, a parameter that places a shape, and a parameter to differentiate."""
+
+
+@pytest.mark.parametrize("name", cases(MOVED_SHAPES, slow=("floor", "lamp", "block in the sun", "box of glass", "ball of fog")))
+def test_the_place_of_a_shape_is_followed(name: str) -> None:
+    """Images to the last bit as by an integrator that has seen no other place; gradients to the rounding of their sums."""
+    make, key, differentiated = MOVED_SHAPES[name]
+    pair, sums = Pair(make(), 4), set()
+    start = dr.detach(pair.params[key])
+    for x in (0.0, 0.05, 0.1, 0.12, 0.03, 0.06):
+        is_mesh = key.endswith("vertex_positions")
+        pair.params[key] = start + x if is_mesh else mi.AffineTransform4f().translate([x, x, x]) @ start
+        pair.params.update()
+        pair.assert_same(0)
+        found, truth = pair.gradients(differentiated, 1)
+        assert np.abs(found - truth).max() <= (200 if truth.size > 3 else 432) * 2**-24 * np.abs(truth).max()
+        image = np.array(mi.render(pair.scene, integrator=mi.load_dict(mivol(max_depth=4)), seed=0, spp=2))
+        assert np.array_equal(pair.images(0)[0], image) and np.abs(truth).max() > 0
+        sums.add((image.sum(), np.abs(truth).sum()))
+        if x == 0.12:
+            count = pair.recordings.count
+    assert len(sums) == 6 and pair.recordings.count == count and not any(pair.recordings.failures.values())
+
+
+def chequered_floor() -> mi.Scene:
+    """Smoke over a floor with colours that turn with it; a quarter turn keeps its bounding box."""
+    colours = np.random.default_rng(2).uniform(0.1, 0.9, (4, 4, 3)).astype(np.float32)
+    texture = {"type": "bitmap", "data": mi.TensorXf(colours), "raw": True, "filter_type": "nearest"}
+    place = mi.ScalarTransform4f().translate([0, 0, -1.5]).scale(3)
+    return among_shapes(floor={"type": "rectangle", "to_world": place, "bsdf": {"type": "diffuse", "reflectance": texture}})
+
+
+PLACED_ANEW: dict[str, tuple[Callable[[], mi.Scene], str, str, list]] = {
+    "quarter turns": (chequered_floor, "floor.to_world", "rotate", [([0, 0, 1], angle) for angle in (0, 90, 180)]),
+    "mirrored": (among_shapes, "ball.to_world", "scale", [(1,), ([-1, 1, 1],), (1,)]),
+    "lamp in smoke": (among_shapes, "lamp.to_world", "translate", [([-0.5, 1, z],) for z in (0, -2.9, -0.1)]),
+    "fire": (fire, "smoke.vertex_positions", "translate", [([x, 0, 0],) for x in (0, 0.1, 0.2)]),
+    "balls apart": (
+        lambda: among_shapes(other={"type": "sphere", "center": [-1.5, 0, 0], "radius": 0.3}),
+        "other.to_world",
+        "translate",
+        [([x, 0, x],) for x in (0, 0.3, 0.5, 0)],
+    ),
+    "flat table of shadows": (
+        lambda: fog_in({"type": "cube"}, interior=medium("homogeneous", 20.0, 0.9)),
+        "smoke.vertex_positions",
+        "scale",
+        [([1, 1, z],) for z in (1, 0.9, 0.5, 0.3)],
+    ),
+}
+"""A scene, a parameter that places a shape, and maps of its first place. They change more than the place."""
+
+
+@pytest.mark.parametrize("name", cases(PLACED_ANEW, slow=("lamp in smoke", "balls apart")))
+def test_a_place_that_changes_more_is_met_as_if_it_were_the_first(name: str) -> None:
+    """To the last bit: by integrators that have and have not seen the other places."""
+    make, key, kind, given = PLACED_ANEW[name]
+    pair, sums = Pair(make(), 3), set()
+    start = dr.detach(pair.params[key])
+    for numbers in given:
+        move = getattr(mi.AffineTransform4f(), kind)(*numbers)
+        if key.endswith("vertex_positions"):
+            pair.params[key] = dr.ravel(move @ dr.unravel(mi.Point3f, start))
+        else:
+            pair.params[key] = move @ start
+        pair.params.update()
+        truth = np.array(mi.render(pair.scene, integrator=mi.load_dict(mivol(max_depth=3)), seed=1, spp=2))
+        for _ in range(2):
+            assert np.array_equal(pair.images(1)[0], truth)
+        sums.add(truth.sum())
+    # A mirrored ball keeps its flipped normals.
+    assert len(sums) >= len(set(map(str, given)))
+
+
+def test_a_gradient_at_an_earlier_place_follows_an_image_elsewhere() -> None:
+    """The arrays of the earlier place are put back beside another albedo: only the last image was made elsewhere."""
+    scene, key = among_shapes(), INSIDE + "albedo.value.value"
+    params, integrator, found = mi.traverse(scene), mi.load_dict(mivol(max_depth=3)), []
+    here = dr.detach(params["floor.to_world"])
+    there = mi.AffineTransform4f().translate([0, 0, -1]) @ here
+    dr.make_opaque(here, there)
+    adjoint = dr.ones(mi.TensorXf, (6, 6, 3))
+    fresh = mi.load_dict(mivol(max_depth=3))
+    for place, one, albedo in ((here, integrator, 0.8), (there, integrator, 0.8), (here, integrator, 0.7), (here, fresh, 0.7)):
+        params["floor.to_world"], params[key] = place, mi.Float(albedo)
+        params.update()
+        dr.enable_grad(params[key])
+        if place is here:
+            one.render_backward(scene, params, adjoint, seed=4, spp=2)
+            found.append(float(dr.grad(params[key])[0]))
+        else:
+            one.render(scene, seed=1, spp=2)
+    assert found[1] == found[2] != 0
+
+
+def test_a_boundary_that_moves_into_another_is_refused() -> None:
+    pair = Pair(smoke_under(other=ball_of(medium("homogeneous", 1.0, 0.5), (3.0, 0.0, 0.0), 0.5), sky=sky(0.7)), 3)
+    pair.assert_same(1)
+    start = dr.detach(pair.params["other.to_world"])
+    for x, is_apart in ((-1.2, True), (-1.7, False)):
+        pair.params["other.to_world"] = mi.AffineTransform4f().translate([x, 0, 0]) @ start
+        pair.params.update()
+        with contextlib.nullcontext() if is_apart else refused("other and smoke overlap"):
+            pair.assert_same(1)
 
 
 def test_a_lamp_that_moves_into_the_smoke_is_planned_anew() -> None:

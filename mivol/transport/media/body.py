@@ -35,6 +35,7 @@ from mivol.transport.traversal.rays import Ray, point_along
 
 __all__ = [
     "Body",
+    "cuts_grids",
     "flight_parts",
     "is_followed",
     "emission_slope",
@@ -65,12 +66,7 @@ class Body:
     def __init__(self, view: MediumView, box: Box | None, estimates_shadows: bool = False, hole: Box | None = None) -> None:
         self.view, self.box, self.estimates_shadows, self.hole = view, box, estimates_shadows, hole
         self.phase = view.phase.prepare()
-        self.cuts_grids = box is not None and (
-            box.is_round
-            or hole is not None
-            or view.emission_density is not None
-            or not all(_fits(part, box) for part in view.parts)
-        )
+        self.cuts_grids = cuts_grids(view, box, hole)
         self.rows = box.rows() if box is not None else None
         self.hole_rows = hole.rows() if hole is not None else None
         self.edge = mi.Float(opaque_numbers(np.array([box.edge]))[0]) if box is not None else None
@@ -307,6 +303,14 @@ def flight_parts(parts: list[Extinction]) -> list[ExactExtinction]:
 
 def _add(a: list[mi.Float], b: list[mi.Float]) -> list[mi.Float]:
     return [x + y for x, y in zip(a, b, strict=True)]
+
+
+def cuts_grids(view: MediumView, box: Box | None, hole: Box | None) -> bool:
+    """Whether a boundary is smaller than its content (``Body.cuts_grids``)."""
+    if box is None:
+        return False
+    is_cut = box.is_round or hole is not None or view.emission_density is not None
+    return is_cut or not all(_fits(part, box) for part in view.parts)
 
 
 def _fits(part: Extinction, box: Box) -> bool:

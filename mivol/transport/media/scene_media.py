@@ -42,6 +42,7 @@ class SceneMedia:
         surface_boxes: (3, 4) maps from the world to cubes [-1, 1]^3 that contain all surfaces and traced boundaries; None if
             unknown.
         tracer: a scene of the surfaces alone, without the boundaries of ``boxed`` media; None to trace ``scene``.
+        lit_box: corners (2, 3) of the box around the boundaries of media; None if unknown.
     """
 
     def __init__(
@@ -56,8 +57,9 @@ class SceneMedia:
         stops_rays: bool = False,
         surface_boxes: Sequence[np.ndarray] | None = None,
         tracer: mi.Scene | None = None,
+        lit_box: np.ndarray | None = None,
     ) -> None:
-        self.scene, self.tracer = scene, tracer or scene
+        self.scene, self.tracer, self.lit_box = scene, tracer or scene, lit_box
         self.boxed = [b for b in bodies if b.box is not None]
         # The tracer tells a segment by its medium, which several boundaries may share.
         self.traced = list({b.view.medium.ptr: b for b in bodies if b.box is None}.values())

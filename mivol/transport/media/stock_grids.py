@@ -23,6 +23,10 @@ TOLERANCE = 0.02
 not fill its boundary deviates by 5e-6 of its size, a nearest-voxel filter by about 0.4."""
 
 
+MAX_PLACES = 256
+"""Most places of grids that are kept."""
+
+
 @dataclass
 class StockGrids:
     """Place and interpolation of the grids of a scene, each found once.
@@ -39,6 +43,8 @@ class StockGrids:
         """Place of a grid (:func:`find_grid_place`)."""
         key = (volume.ptr, None if boundary is None else boundary.to_world.tobytes())
         if key not in self.places:
+            # A boundary that moves has a new key in each step.
+            self.places = dict(list(self.places.items())[-MAX_PLACES:])
             self.places[key] = find_grid_place(volume, boundary)
         return self.places[key]
 

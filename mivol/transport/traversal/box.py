@@ -23,6 +23,7 @@ __all__ = [
     "Box",
     "clip_to_ball",
     "clip_to_box",
+    "evaluated_numbers",
     "fit_ball",
     "fit_box",
     "is_in_box",
@@ -124,6 +125,17 @@ def opaque_numbers(values: np.ndarray) -> list[mi.Float64]:
     if first is None:
         return [dr.opaque(mi.Float64, float(v)) for v in values]
     return [dr.gather(mi.Float64, numbers, start + (first + k)) for k in range(len(values))]
+
+
+def evaluated_numbers(values: np.ndarray) -> list[mi.Float64]:
+    """:func:`opaque_numbers` in memory, for a kernel over all lanes whose other inputs are tables.
+
+    Dr.Jit 1.5 guesses the number of lanes of a recorded kernel from its inputs. If the kernel only gathers, it guesses by the
+    sizes of the tables, and may compute too few lanes.
+    """
+    numbers = opaque_numbers(values)
+    dr.eval(numbers)
+    return numbers
 
 
 def opaque_rows(rows: np.ndarray) -> list[list[mi.Float64]]:

@@ -177,7 +177,7 @@ class DirectLighting:
     def emitters(self) -> SceneEmitters:
         """The emitters of the scene. Their tables are made at the first call, which must not lie in a recorded loop."""
         with dr.suspend_grad():
-            return SceneEmitters(self.media.scene, self.media.start is not None, balls=self._balls)
+            return self._find_emitters("any")
 
     @cached_property
     def near_emitters(self) -> SceneEmitters:
@@ -194,7 +194,10 @@ class DirectLighting:
         if all((everyone.bounding_ball(k) is not None) == (distance == "near") for k in range(len(everyone.sampled))):
             return everyone
         with dr.suspend_grad():
-            return SceneEmitters(self.media.scene, self.media.start is not None, distance, self._balls)
+            return self._find_emitters(distance)
+
+    def _find_emitters(self, distance: str) -> SceneEmitters:
+        return SceneEmitters(self.media.scene, self.media.start is not None, distance, self._balls, self.media.lit_box)
 
     def sample_emitter(
         self, it: mi.Interaction3f, u: mi.Point2f, active: mi.Bool, emitters: SceneEmitters | None = None

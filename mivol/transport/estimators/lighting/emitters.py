@@ -19,6 +19,7 @@ import numpy as np
 
 from mivol.kernel_recording import copy_aligned, is_recording
 from mivol.transport.estimators.lighting.emitter_grid import EmitterDistribution, tabulate_emitters
+from mivol.transport.traversal.box import evaluated_numbers
 from mivol.transport.traversal.random_numbers import SpreadSampler, draw_state, fork_state
 from mivol.transport.traversal.rays import Ray
 
@@ -56,6 +57,7 @@ class SceneEmitters:
         from_camera: media surround the camera, so rays scatter light from their origin on.
         distance: ``near`` for the emitters with a position alone, ``far`` for the emitters at infinity alone, ``any`` for all.
         balls: numbers of :func:`read_balls`; by default read from the scene.
+        lit_box: corners of :func:`find_lit_box`; by default found in the scene.
 
     Attributes:
         sampled: emitters that next-event estimation chooses from: all except a constant environment.
@@ -66,7 +68,12 @@ class SceneEmitters:
     """
 
     def __init__(
-        self, scene: mi.Scene, from_camera: bool = False, distance: str = "any", balls: mi.Float | None = None
+        self,
+        scene: mi.Scene,
+        from_camera: bool = False,
+        distance: str = "any",
+        balls: mi.Float | None = None,
+        lit_box: np.ndarray | None = None,
     ) -> None:
         placed = list(zip(scene.emitters(), _find_balls(scene, balls), strict=True))
         if distance != "any":
@@ -84,7 +91,7 @@ class SceneEmitters:
         if self.sampled:
             self._table = _EmitterTable.of(scene, self.sampled, self._balls)
             several = sum(ball is not None for ball in self._balls) > 1
-            box = self._table.find_varied_box(find_lit_box(scene), several)
+            box = self._table.find_varied_box(find_lit_box(scene) if lit_box is None else lit_box, several)
             self._grid = tabulate_emitters(self._table.pointers, *box, self._balls)
 
     def number_of(self, emitter: mi.EmitterPtr) -> mi.UInt32:
@@ -240,13 +247,14 @@ class _EmitterTable:
         x, y, z, r, finite = (dr.gather(mi.Float, column, number) for column in self.balls)
         return x, y, z, r, finite > 0
 
-    def find_varied_box(self, lit: mi.ScalarBoundingBox3f, several: bool) -> tuple[mi.Point3f, mi.Vector3f]:
-        """Centre and half edges of the part of a box in which the shares of emitters vary [length]: near the emitters.
+    def find_varied_box(self, lit: np.ndarray, several: bool) -> tuple[mi.Point3f, mi.Vector3f]:
+        """Centre and half edges of the part of a box (2 corners, 3) in which the shares of emitters vary [length]: near them.
 
         Far away from all emitters with a position, shares are even. The part reaches beyond them by half of their largest
         distance along an axis. Without ``several`` such emitters, or if all lie far outside, it is the whole box.
         """
-        low, high = (mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in corner)) for corner in (lit.min, lit.max))
+        numbers = evaluated_numbers(lit.ravel())
+        low, high = mi.Point3f(*numbers[:3]), mi.Point3f(*numbers[3:])
         if several:
             *axes, r, finite = self.balls
             below = mi.Point3f(*(dr.min(dr.select(finite > 0, x - r, dr.inf)) for x in axes))
@@ -266,14 +274,14 @@ def join_arrays(values: list[mi.Float] | list[mi.UInt32]) -> mi.Float | mi.UInt3
     return values[0]
 
 
-def find_lit_box(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
-    """The box around all boundaries of media; around the scene without boundaries; of zero size without shapes."""
+def find_lit_box(scene: mi.Scene) -> np.ndarray:
+    """Corners (2, 3) of the box around all boundaries of media; around the scene without boundaries; 0 without shapes."""
     shapes = scene.shapes()
     boxes = [s.bbox() for s in shapes if s.is_medium_transition()] or [s.bbox() for s in shapes]
     found = mi.ScalarBoundingBox3f()
     for box in boxes:
         found.expand(box)
-    return found if found.valid() else mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0))
+    return np.array([found.min, found.max], np.float64) if found.valid() else np.zeros((2, 3))
 
 
 def _is_transmissive(emitter: mi.Emitter) -> bool:

@@ -26,7 +26,7 @@ from mivol.transport.estimators.lighting.emitters import SceneEmitters
 from mivol.transport.estimators.lighting.shadow_rays import NEGLIGIBLE_TAU, trace_shadow_ray
 from mivol.transport.media.extinction import to_spectrum
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.box import Box, map_point, opaque_rows
+from mivol.transport.traversal.box import Box, evaluated_numbers, map_point
 from mivol.transport.traversal.interpolation import interpolate
 from mivol.transport.traversal.lattice import Lattice
 from mivol.transport.traversal.rays import Ray
@@ -38,6 +38,7 @@ __all__ = [
     "find_sun",
     "measure_transmittance_bias",
     "optical_depth_towards",
+    "place_nodes",
 ]
 
 
@@ -103,6 +104,22 @@ def find_sun(emitter: mi.Emitter) -> tuple[mi.Vector3f, mi.Float]:
 # -- The table ----------------------------------------------------------------------------------------------------------
 
 
+def place_nodes(corners: np.ndarray, edge: int) -> tuple[tuple[int, int, int], Box]:
+    """Place about ``edge``^3 nodes at equal distances in a box along the axes of the world.
+
+    Args:
+        corners: corners of the box, (2, 3) [length].
+        edge: number of nodes.
+
+    Returns:
+        The number of nodes along z, y, x, and the box. A flat box is made thicker: it would have no map from the world.
+    """
+    size = corners[1] - corners[0]
+    box = Box(np.diag([*np.maximum(size, max(1e-6 * size.max(), 1e-30)), 1.0]))
+    box.to_world[:3, 3] = corners[0]
+    return tuple(max(2, min(2 * edge, round(edge * box.to_world[a, a] / box.edge))) for a in (2, 1, 0)), box
+
+
 @dataclass
 class TransmittanceGrid:
     """Optical depth towards each emitter at the nodes of a lattice over a box.
@@ -139,23 +156,18 @@ class TransmittanceGrid:
         return cls._integrate(media, emitters, nodes, Box(lattice.to_world))
 
     @classmethod
-    def over_box(cls, media: SceneMedia, emitters: SceneEmitters, box: mi.ScalarBoundingBox3f, edge: int) -> TransmittanceGrid:
-        """Integrate over a box in the world, with about ``edge``^3 nodes at equal distances.
+    def over_box(cls, media: SceneMedia, emitters: SceneEmitters, corners: np.ndarray, edge: int) -> TransmittanceGrid:
+        """Integrate over a box along the axes of the world, with about ``edge``^3 nodes at equal distances.
 
         Args:
             media: media and surfaces.
             emitters: emitters of the scene; environments count in the direction of their sun.
-            box: the box.
+            corners: corners of the box, (2, 3) [length].
             edge: number of nodes.
 
         Bias, cost: as of :meth:`over_lattice`.
         """
-        size = np.array(box.extents(), np.float64)
-        # A flat box has no map from the world.
-        placed = Box(np.diag([*np.maximum(size, max(1e-6 * size.max(), 1e-30)), 1.0]))
-        placed.to_world[:3, 3] = box.min
-        nodes = tuple(max(2, min(2 * edge, round(edge * placed.to_world[a, a] / placed.edge))) for a in (2, 1, 0))
-        return cls._integrate(media, emitters, nodes, placed)
+        return cls._integrate(media, emitters, *place_nodes(corners, edge))
 
     @classmethod
     def _integrate(
@@ -171,7 +183,8 @@ class TransmittanceGrid:
         at = (index % x, (index // x) % y, index // (x * y))
         # Slightly inside, since a shadow ray in the plane of a face counts as outside the box.
         u = [dr.clip(mi.Float(a) / (m - 1), INSET, 1 - INSET) for a, m in zip(at, (x, y, z), strict=True)]
-        p = mi.Point3f(*(map_point(row, u) for row in opaque_rows(box.to_world[:3])))
+        numbers = evaluated_numbers(box.to_world[:3].ravel())
+        p = mi.Point3f(*(map_point(numbers[k : k + 4], u) for k in (0, 4, 8)))
         count, k = len(emitters.sampled), media.channels
         suns = [find_sun(e)[0] if e.is_environment() else None for e in emitters.sampled]
         tau = dr.zeros(mi.Float, z * y * x * count * k)
