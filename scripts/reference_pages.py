@@ -200,7 +200,7 @@ def written(parameter: inspect.Parameter) -> str:
     note = parameter.annotation
     kind = note if isinstance(note, str) else inspect.formatannotation(getattr(note, "__origin__", note))
     if parameter.default is inspect.Parameter.empty:
-        return f"{parameter.name}: {kind}"
+        return f"{'**' * (parameter.kind is inspect.Parameter.VAR_KEYWORD)}{parameter.name}: {kind}"
     default = "..." if " at 0x" in repr(parameter.default) else repr(parameter.default)
     return f"{parameter.name}: {kind} = {default}"
 

@@ -196,7 +196,8 @@ def optimize(
         The fit: ``fit.values()`` has the parameters, ``fit.history`` the losses.
 
     Raises:
-        MivolError: no problem, settings outside their domains, a loss that is not finite, or a scene that cannot be rendered.
+        MivolError: ``problem`` is of another type, settings outside their domains, a loss that is not finite, or a scene that
+            cannot be rendered.
         KeyboardInterrupt: Ctrl-C; the scene holds the newest parameters.
     """
     if not hasattr(problem, "initial_reals"):
@@ -212,13 +213,13 @@ def optimize(
 def explain(
     scene: SceneSource | mi.Scene, max_depth: int | None = None, sensor: int | mi.Sensor = 0, noise: float | None = None
 ) -> str:
-    """Say what a scene needs and how mivol would render it, before more than a small preview is rendered.
+    """Say what a scene needs and how mivol would render it. At most small previews are rendered.
 
     Args:
         scene: a scene, a dict, or the path of an XML file.
         max_depth: longest path; None means the settings of the scene's own integrator.
         sensor: a sensor, or its index.
-        noise: noise of a pixel over the mean radiance; the smallest ``max_depth`` that neglects less is measured
+        noise: noise of a pixel over the mean radiance. Measure the smallest ``max_depth`` that neglects less light than this
             (:mod:`mivol.scene.previews`); None to measure nothing.
 
     Returns:

@@ -59,7 +59,7 @@ def make_procedural(name: str, shape: Sequence[int], seed: int, peak: float) -> 
     """Make a procedural volume.
 
     Args:
-        name: key of PROCEDURAL.
+        name: "tangle", the only key of PROCEDURAL.
         shape: (Z, Y, X).
         seed: selects the object.
         peak: largest possible value [unit of the field].

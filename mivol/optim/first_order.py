@@ -116,7 +116,7 @@ memory the share 1 - memory of a step would be less than ten times the rounding,
 
 
 class RMSprop(FirstOrder, tag="rmsprop"):
-    """RMSprop without momentum, on numbers with a derivative; the first derivative is its own mean.
+    """RMSprop without momentum. Numbers without a derivative stay; the first squared derivative begins the running mean.
 
     A row of a field is reached by a few views at a time. Momentum from earlier views would pull the row away. Source: Hinton
     2012, lecture 6e.

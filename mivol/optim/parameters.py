@@ -155,8 +155,8 @@ class Parameter:
         unit: unit of the value, for labels; by default the usual unit of the key.
         domain: (low, high), closed; ends may be infinite. By default the domain that makes sense for the key: an extinction is
             not negative, an albedo is at most 1.
-        map: key of MAPS.
-        lr: step of Adam, in the map's reals (identity: the parameter's own unit).
+        map: "identity", "softplus", "log" or "logistic": how a free real number becomes the value.
+        lr: step of Adam in this real number; with "identity" it has the parameter's unit.
         extent: edges (z, y, x) of a grid's box [length], for the voxel size in priors.
         priors: prior knowledge about the field.
     """

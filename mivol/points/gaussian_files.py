@@ -470,7 +470,7 @@ def write_gaussians(path: str | os.PathLike, gaussians: Gaussians, view: HomeVie
         view: first view; a ``.ply`` keeps it as a comment, a ``.html`` begins with it, other formats leave it out.
 
     Raises:
-        MivolError: an unknown suffix, no Gaussians for a format other than ``.ply``, numbers that no renderer can draw, or a
+        MivolError: an unknown suffix, an empty set for a format other than ``.ply``, numbers that no renderer can draw, or a
             full disk.
     """
     path = Path(path)

@@ -36,7 +36,7 @@ ROW_SHAPES = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "opacity_l
 @with_short_repr
 @dataclass(frozen=True)
 class Gaussians:
-    """N Gaussians; float32, C-contiguous, for any real input arrays.
+    """N Gaussians. Input arrays of any real type become float32 and C-contiguous.
 
     Attributes:
         means: (N, 3) centres, world [length].

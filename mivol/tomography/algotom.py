@@ -45,7 +45,7 @@ def run_algotom(
         options: further arguments of the method.
 
     Returns:
-        Projections like ``y``; of an axis finder, its columns (n,), whose scatter shows how far they can be believed.
+        Projections like ``y``. An axis finder returns columns (n,) instead; their scatter shows how reliable they are.
 
     Raises:
         MivolError: algotom is not installed, an unknown method or option, projections of another shape, or a method that fails.

@@ -123,7 +123,10 @@ class Projector:
         kernels: kernels of another projector of this grid, to share recordings; by default its own.
 
     Attributes:
-        shape: (rays, voxels). dtype: float32. n_views: number of views. projection_shape: (views, rows, cols).
+        shape: (rays, voxels).
+        dtype: float32.
+        n_views: number of views.
+        projection_shape: (views, rows, cols).
         T: the transpose, with ``@``, ``shape`` and ``T``.
 
     Cost: a walk through the grid per ray; memory 28 bytes per ray up to CACHE_BYTES, besides x and y.

@@ -111,8 +111,8 @@ def render_reference(
 
     Raises:
         MivolError: an integrator that cannot make a reference, a scene for which Mitsuba is known to be wrong, a file of
-            another scene or method, a film that is not rgb or luminance or does not fit into memory, a target out of reach of
-            32 batches, or a sample that is not finite.
+            another scene or method, a film that is not rgb or luminance or does not fit into memory, a ``max_spp`` too
+            small for 32 batches, or a sample that is not finite.
     """
     prepared = prepare_reference(
         scene, out, max_depth=max_depth, target_se=target_se, relative=relative, max_spp=max_spp, integrator=integrator,

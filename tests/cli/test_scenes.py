@@ -251,11 +251,12 @@ def test_a_pixel_of_the_tank_is_not_weighed_by_its_own_noise(glass):
 def test_tank_in_glass(tmp_path, glass, variant_rgb):
     """A channel of few pixels, from a start that is a quarter off: nearer than the start, and within 5 standard errors.
 
-    The errors are some 6 % for sigma_s and 0.4 % for sigma_a (3 seeds). With a quarter of the samples some seeds end far off.
+    The errors are some 4 % for sigma_s and 0.4 % for sigma_a (3 seeds). Some seeds end far off with a quarter of the samples,
+    and one of three with 8 x 8 pixels.
     """
     truth = np.array([0.154, 0.183, 0.929])
     given = SimpleNamespace(
-        output=tmp_path, dilutions=[0.1, 0.2], size=12, photo_spp=4096, max_depth=-1, iterations=4, rounds=4, seed=0
+        output=tmp_path, dilutions=[0.1, 0.2], size=10, photo_spp=4096, max_depth=-1, iterations=4, rounds=4, seed=0
     )
     photographs = glass["photographs_of"](glass["XML"], truth, 2, 0, given)
     sought = np.array([np.log(truth[0]), np.log(truth[1]), np.arctanh(truth[2])])
