@@ -278,7 +278,7 @@ def write_volume(
         to_world: unit cube to world (4, 4), by default the identity, or the place of the sparse volume. A ``.vol``
             holds an axis-aligned box, a ``.mrc`` too, a ``.tif`` voxel sizes alone, a ``.npy`` no box.
         metadata: facts in the types of JSON, for ``.npz`` and ``.nrrd``; "space" names the frame ("RAS", "LPS") there and in
-            ``.nii`` and ``.mha``, "unit" the unit of ``.nii``, ``.tif`` and ``.zarr``.
+            ``.nii`` and ``.mha``, "unit" the unit of ``.nii``, ``.nrrd``, ``.tif`` and ``.zarr``.
         compress: whether a ``.npz`` is compressed; writing without compression is about ten times faster.
 
     Raises:
@@ -396,7 +396,8 @@ def describe_volume(path: Path, dataset: str | None = None, **layout: Any) -> st
         f"voxels (x, y, z): {size}, {channels} channel{'s' if channels > 1 else ''} of {dtype}, {memory}",
         f"box: {format_point(corners.min(axis=0))} to {format_point(corners.max(axis=0))}"
         + (" around the turned axes" if is_turned else "")
-        + f"; voxel {format_point(volume.spacing)}",
+        + f"; voxel {format_point(volume.spacing)}"
+        + (f" {volume.meta['unit']}" if volume.meta.get("unit") in tiff.METRES else ""),
     ]
     if finite.any():
         inside = values[finite]
@@ -451,7 +452,7 @@ def convert_volume(source: Path, target: Path, dataset: str | None = None, **lay
     if facts and suffix not in (".npz", ".nrrd", ".mhd", ".mha", ".nii"):
         lost.insert(0, f"the frame {facts.pop('space')}")
     unit = str(volume.meta.get("unit") or "")
-    if suffix in (".nii", ".tif", ".tiff", ".zarr", ".npz"):
+    if suffix in (".nii", ".nrrd", ".tif", ".tiff", ".zarr", ".npz"):
         facts |= {"unit": unit} if unit else {}
         if suffix == ".nii" and unit in tiff.METRES and unit not in nifti.UNITS.values():
             lost.append(f"the unit {unit}")

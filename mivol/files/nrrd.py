@@ -104,6 +104,7 @@ def read_nrrd(path: Path, dataset: str | None = None) -> VolumeData:
         "format": "nrrd",
         "dtype": str(dtype),
         "space": SPACES.get(fields.get("space", "").lower()),
+        "unit": _read_unit(fields, spatial),
         "header": fields,
     }
     return VolumeData(to_values(grid, path), frame_from_steps(size, steps, origin), meta)
@@ -127,8 +128,11 @@ def write_nrrd(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadat
         "encoding: gzip",
         f"space origin: {_vector(origin)}",
     ]
+    unit = str(metadata.get("unit", "")).replace('"', "")
+    if unit not in ("", "voxel", "unknown"):
+        lines.append("space units:" + f' "{unit}"' * 3)
     for key, value in metadata.items():
-        if key != "space":
+        if key not in ("space", "unit"):
             escaped = str(value).replace("\\", "\\\\").replace("\n", "\\n")
             lines.append(f"{key}:={escaped}")
     file.write(("\n".join(lines) + "\n\n").encode("utf-8"))
@@ -248,6 +252,15 @@ def _place(fields: dict[str, str], spatial: list[int], size: list[int], path: Pa
     if "space origin" not in fields:
         origin = np.where(np.isnan(low), 0.0, low + spacing / 2)
     return np.diag(spacing), origin
+
+
+def _read_unit(fields: dict[str, str], spatial: list[int]) -> str | None:
+    """The unit of length, if it is the same along all three axes: ``space units``, or ``units`` of each axis of the file."""
+    units = re.findall(r'"([^"]*)"', fields.get("space units", ""))
+    if not units:
+        of_axes = re.findall(r'"([^"]*)"', fields.get("units", ""))
+        units = [of_axes[axis] for axis in spatial if axis < len(of_axes)]
+    return units[0] if len(units) == 3 and len(set(units)) == 1 and units[0] else None
 
 
 def _per_axis(fields: dict[str, str], name: str, spatial: list[int], count: int, default: float, path: Path) -> np.ndarray:

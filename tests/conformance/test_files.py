@@ -146,6 +146,20 @@ def test_nrrd_channels_first_or_last(tmp_path: Path) -> None:
     assert_volume(read(tmp_path, "last.nrrd", head.encode() + made.packed(planes, "f4")), values)
 
 
+@pytest.mark.parametrize(
+    ("field", "units", "unit"),
+    [
+        ("space units", '"mm" "mm" "mm"', "mm"),
+        ("units", '"um" "um" "um"', "um"),
+        ("space units", '"mm" "mm" "s"', None),
+        ("units", '"" "" ""', None),
+    ],
+)
+def test_nrrd_units(tmp_path: Path, field: str, units: str, unit: str | None) -> None:
+    """One unit of all three axes."""
+    assert read(tmp_path, "a.nrrd", made.nrrd(made.numbered(), **{field: units})).meta["unit"] == unit
+
+
 def test_nrrd_rotated(tmp_path: Path) -> None:
     """x points along world y, y along -x, with a shear in z."""
     values = made.numbered()

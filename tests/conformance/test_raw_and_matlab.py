@@ -68,7 +68,8 @@ def test_a_toml_file_beside_raw_bytes_is_found(tmp_path: Path, capsys: pytest.Ca
     np.testing.assert_allclose((volume.spacing, volume.origin), ((0.5, 1, 2), (3, 4, 5)))
     assert volume.meta["unit"] == "mm"
     assert run("explain", tmp_path / "a.raw") == 0
-    assert "raw bytes by a TOML file\n" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "raw bytes by a TOML file\n" in said and "voxel (0.5, 1, 2) mm\n" in said
     assert run("convert", tmp_path / "a.raw", tmp_path / "b.zarr") == 0
     assert read_volume(tmp_path / "b.zarr").meta["unit"] == "mm"
     for wrong, said in (

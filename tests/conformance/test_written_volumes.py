@@ -91,7 +91,9 @@ def test_a_voxel_size_of_0_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
     np.testing.assert_array_equal(read_volume(tmp_path / "a.mrc").spacing, (1, 1, 1))
 
 
-@pytest.mark.parametrize(("suffix", "lost"), [(".nii", "the unit A"), (".nrrd", "the unit A"), (".mrc", ""), (".zarr", "")])
+@pytest.mark.parametrize(
+    ("suffix", "lost"), [(".nii", "the unit A"), (".mha", "the unit A"), (".nrrd", ""), (".mrc", ""), (".zarr", "")]
+)
 def test_convert_says_which_unit_is_lost(tmp_path: Path, capsys: pytest.CaptureFixture, suffix: str, lost: str) -> None:
     """MRC has angstrom, which NIfTI does not know."""
     write_volume(tmp_path / "a.mrc", values())
