@@ -84,6 +84,9 @@ def _straighten(data: Projections, beam: ParallelBeam | ConeBeam, degree: int, w
         part = slice(first, first + MOST_ROWS)
         beam = replace(beam.select_rows(part), detector_offset=(0.0, beam.detector_offset[1]))
     found = fit_hardening(Projector(beam, grid_of_detector(beam)), data.y[:, part], data.weights[:, part], degree, with_scatter)
+    if not found.is_needed:
+        note = "line integrals get no straighter by a polynomial: nothing is changed (data.hardening, for one material)"
+        return replace(data, notes=(*data.notes, note))
     y, weights = found.straighten(data.y, data.weights)
     terms = " ".join(f"{c:+.3g} y^{k}" for k, c in enumerate(found.coefficients, 2))
     light = f", scattered light {found.scatter:.3g} of the light" if with_scatter else ""

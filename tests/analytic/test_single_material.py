@@ -7,6 +7,7 @@ import pytest
 from refusals import assert_refused
 
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
+from mivol.tomography.phantoms import random_ellipsoids
 from mivol.tomography.preprocess import Transmission
 from mivol.tomography.projector import Projector
 from mivol.tomography.single_material import filter_phase, fit_hardening, phase_length
@@ -91,10 +92,20 @@ def test_scattered_light_of_one_energy_is_found(variant_rgb) -> None:
     assert dark[1].item() == 0
 
 
-def test_straight_lines_stay(variant_rgb) -> None:
-    """One energy: the polynomial changes line integrals by less than the voxels' own error, 2 %."""
+@pytest.mark.parametrize("degree", [2, 3])
+@pytest.mark.parametrize("photons", [3e3, 1e5])
+def test_straight_lines_need_no_polynomial(variant_rgb, photons: float, degree: int) -> None:
+    """One energy, one material: no polynomial lowers the misfit."""
     a, length = Projector(BEAM, VoxelGrid((1, COLUMNS, COLUMNS), 1 / 32)), two_discs()
-    y = 1.5 * length
-    straight, _ = fit_hardening(a, y, np.ones(y.shape), 2, False).straighten(y, np.ones(y.shape))
-    assert np.abs(straight - y).max() < 0.02 * y.max()
-    assert_refused("no material", fit_hardening, a, 0 * y, np.ones(y.shape), 2, False)
+    counts = np.random.default_rng(1).poisson(photons * np.exp(-1.5 * length)).astype(float)
+    assert not fit_hardening(a, -np.log(counts / photons), counts, degree, False).is_needed
+    assert_refused("no material", fit_hardening, a, 0 * length, np.ones(length.shape), 2, False)
+
+
+def test_several_materials_are_refused(variant_rgb) -> None:
+    """Forty ellipsoids of one energy: a polynomial of degree 3 lowers the misfit, and spoils the line integrals."""
+    beam = ParallelBeam(np.arange(48) * np.pi / 48, (1, COLUMNS))
+    y = random_ellipsoids(40, 11, 26).project(beam)
+    y /= y.max()
+    a = Projector(beam, VoxelGrid((1, COLUMNS, COLUMNS)))
+    assert_refused("whose slope falls to .* several materials", fit_hardening, a, y, np.ones(y.shape), 3, False)

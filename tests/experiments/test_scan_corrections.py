@@ -50,9 +50,8 @@ def test_hardening_is_fitted_in_eight_rows_of_a_parallel_beam(
         asked.append((a.geometry.detector, a.geometry.detector_offset, degree, scatter))
         np.testing.assert_array_equal(y, data.y[:, rows])
         np.testing.assert_array_equal(weights, data.weights[:, rows])
-        return SimpleNamespace(
-            straighten=lambda y, weights: (2 * y, weights / 4), coefficients=(0.5, -0.25), scatter=0.125, misfit=0.5
-        )
+        straight = {"straighten": lambda y, weights: (2 * y, weights / 4), "coefficients": (0.5, -0.25), "scatter": 0.125}
+        return SimpleNamespace(**straight, misfit=0.5, is_needed=True)
 
     monkeypatch.setattr(corrections, "fit_hardening", fit)
     found = corrections.straighten_lines(settings_of(hardening=3, scatter=with_scatter), data)
@@ -68,6 +67,10 @@ def test_hardening_is_fitted_in_eight_rows_of_a_parallel_beam(
     ((name, before, after),) = found.pictures
     assert name == "hardening"
     np.testing.assert_array_equal([before, after], [data.y[:, 6], 2 * data.y[:, 6]])
+    monkeypatch.setattr(corrections, "fit_hardening", lambda *_: SimpleNamespace(is_needed=False))
+    same = corrections.straighten_lines(settings_of(hardening=3, scatter=with_scatter), data)
+    assert same.y is data.y and same.weights is data.weights and same.pictures == data.pictures
+    assert "nothing is changed (data.hardening" in same.notes[-1]
 
 
 @pytest.mark.parametrize("is_needed", [True, False])
