@@ -75,9 +75,9 @@ def filter_phase(
 
 
 LEAST_GAIN, LEAST_SLOPE = 0.05, 0.5
-"""Share of the misfit that a correction removes at least, and the smallest slope of its polynomial. Light that hardens gives slopes
-of 1 and more. In bodies of one material, fits to 3,000 quanta a pixel that lower the misfit have slopes of .65 and more; in bodies
-of several materials, slopes fall to .04 to .2, and the errors of line integrals rise three- to fiftyfold."""
+"""Share of the misfit that a correction removes at least, and the smallest slope of its polynomial. Light that hardens gives
+slopes of 1 and more. In bodies of one material, fits to 3,000 quanta a pixel that lower the misfit have slopes of .65 and more.
+In bodies of several materials, slopes fall to .04 to .2, and the errors of line integrals rise three- to fiftyfold."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,8 +155,9 @@ def fit_hardening(a: Projector, y: np.ndarray, weights: np.ndarray, degree: int,
     slope = float((np.diff(_evaluate(found.coefficients, top)) / np.diff(top)).min())
     if found.is_needed and slope < LEAST_SLOPE:
         raise MivolError(
-            f"found a polynomial of degree {degree} whose slope falls to {slope:.2g}, expected at least {LEAST_SLOPE:g}, because "
-            "light hardens in matter: leave data.hardening out for objects of several materials, or choose a smaller degree."
+            f"found a polynomial of degree {degree} whose slope falls to {slope:.2g}, expected at least {LEAST_SLOPE:g}, "
+            "because light hardens in matter: leave data.hardening out for objects of several materials, or choose a smaller "
+            "degree."
         )
     return found
 

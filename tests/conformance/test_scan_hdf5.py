@@ -32,6 +32,29 @@ def test_frames_are_told_apart_by_their_key(tmp_path: Path, name: str) -> None:
     assert is_scan(path) and not is_scan(tmp_path / "no file")
 
 
+def test_scans_of_the_package_nxtomo(tmp_path: Path) -> None:
+    """What it writes is read back equal, and it reads the layout of the files of these tests."""
+    nxtomo, units = (pytest.importorskip(name) for name in ("nxtomo.application.nxtomo", "pint"))
+    units = units.get_application_registry()
+    scan = nxtomo.NXtomo()
+    detector, key = scan.instrument.detector, np.array(KEY)
+    detector.data, detector.image_key_control = FRAMES, key
+    detector.x_pixel_size, detector.y_pixel_size = 2e-6 * units.meter, 4e-6 * units.meter
+    detector.distance = 0.05 * units.meter
+    scan.sample.rotation_angle = DEGREES * units.degree
+    scan.save(str(tmp_path / "a.nx"), "entry0000")
+    found = read_projections(tmp_path / "a.nx")
+    for values, kind in ((found.projections, 0), (found.flats, 1), (found.darks, 2)):
+        np.testing.assert_array_equal(values, FRAMES[key == kind])
+    np.testing.assert_allclose(found.angles, np.radians(DEGREES[key == 0]), rtol=1e-15)
+    assert found.pitch == pytest.approx((4e-3, 2e-3)) and found.distances == (None, pytest.approx(50))
+    path = write_nxtomo(tmp_path / "b.nx")
+    back = nxtomo.NXtomo().load(str(path), "entry", detector_data_as="as_numpy_array")
+    np.testing.assert_array_equal(back.instrument.detector.data, FRAMES)
+    assert [int(kind.value) for kind in back.instrument.detector.image_key] == KEY
+    np.testing.assert_allclose(back.sample.rotation_angle.to("degree").magnitude, DEGREES)
+
+
 def test_frames_of_the_alignment_are_no_views(tmp_path: Path) -> None:
     """They are called views (0) in image_key, and -1 in image_key_control; a control of another length tells nothing."""
     path = write_nxtomo(tmp_path / "a.nxs")
