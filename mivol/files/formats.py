@@ -456,7 +456,9 @@ def convert_volume(source: Path, target: Path, dataset: str | None = None, **lay
         facts |= {"unit": unit} if unit else {}
         if suffix == ".nii" and unit in tiff.METRES and unit not in nifti.UNITS.values():
             lost.append(f"the unit {unit}")
-    elif unit in tiff.METRES and (suffix, unit) != (".mrc", "A"):
+    elif suffix == ".mrc" and unit in tiff.METRES:  # lengths in MRC are in angstrom
+        place = np.diag([*[tiff.METRES[unit] / tiff.METRES["A"]] * 3, 1.0]) @ place
+    elif unit in tiff.METRES:
         lost.append(f"the unit {unit}")
     if suffix in SPARSE_READERS and "grid" in volume.meta:
         facts["grid"] = str(volume.meta["grid"]).partition("[")[0]

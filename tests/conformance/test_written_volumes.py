@@ -103,6 +103,16 @@ def test_convert_says_which_unit_is_lost(tmp_path: Path, capsys: pytest.CaptureF
     assert (read_volume(tmp_path / f"b{suffix}").meta.get("unit") == "A") == (not lost)
 
 
+def test_lengths_become_angstrom_in_mrc(tmp_path: Path) -> None:
+    place = np.diag([4.0, 6.0, 8.0, 1.0])
+    place[:3, 3] = 1, 2, 3
+    write_volume(tmp_path / "a.nrrd", values(), place, metadata={"unit": "um"})
+    assert main(["convert", str(tmp_path / "a.nrrd"), str(tmp_path / "b.mrc")]) == 0
+    volume = read_volume(tmp_path / "b.mrc")
+    np.testing.assert_allclose(volume.to_world[:3], 1e4 * place[:3], rtol=1e-6)
+    assert volume.meta["unit"] == "A"
+
+
 @pytest.mark.parametrize(
     ("suffix", "lost"),
     [
