@@ -78,6 +78,10 @@ OWN_RAYS, EMISSION_COST, MIRROR_COST, MIN_OWN_GAIN = (0.0625, 0.125, 0.25, 0.5, 
 the time of a path (measured: 0.9 in an explosion of 160 x 160 x 240 nodes, depth 8; mirrors 0.3 to 0.5 in balls of glass), and
 the smallest predicted gain."""
 
+KEPT_COST = 1.2
+"""Time of a path with a kept mirrored ray over the time of a path without (measured: 1.07 and 1.2 in balls of thin glass, 1.25
+in milk in a glass)."""
+
 MIN_BRANCHING_SAMPLES, MAX_IMAGE_BRANCHES, MAX_BRANCHING_TIME, MIN_BRANCHING_GAIN = 1 << 16, 4, 2.0, 1.1
 """Samples of an image below which no preview measures branches, most branches of a path, most time of an image over the time
 without branches, and the smallest predicted gain in variance x time."""
@@ -506,7 +510,8 @@ def choose_emission_rays(needs: Needs, settings: Settings, segment: str) -> tupl
     if not is_emission_noise_open(needs, settings, segment) or needs.emission_noise is None:
         return 0, []
     words = "emission in view", "found by paths", "summed"
-    return _choose_own_rays(needs.emission_noise, needs.spp, EMISSION_COST, *words)
+    count, _, choice = _choose_own_rays(needs.emission_noise, needs.spp, EMISSION_COST, *words)
+    return count, [choice]
 
 
 def is_mirror_noise_open(needs: Needs, settings: Settings, segment: str) -> bool:
@@ -518,21 +523,31 @@ def is_mirror_noise_open(needs: Needs, settings: Settings, segment: str) -> bool
     return needs.are_samples_independent and needs.is_colour_film and needs.film_samples >= MIN_LAMP_SAMPLES
 
 
-def choose_mirror_rays(needs: Needs, settings: Settings, segment: str) -> tuple[int, list[Choice]]:
-    """Choose the number of own camera rays of a pixel for the light that the first glass mirrors, in images; 0 for none.
+def choose_mirror_rays(needs: Needs, settings: Settings, segment: str) -> tuple[int, bool, list[Choice]]:
+    """Choose a way to find the light mirrored by glass, in images.
 
-    Glass mirrors some 4 to 8 % of the light, so that by chance few samples see what a mirror shows.
+    Glass mirrors 4 to 8 % of the light, so by chance few samples see a mirror image.
+
+    Returns:
+        Number of own camera rays of a pixel for the light mirrored by the first glass, or 0; and whether paths keep a mirrored
+        ray.
     """
     if not is_mirror_noise_open(needs, settings, segment) or needs.mirror_noise is None:
-        return 0, []
-    words = "light mirrored by glass", "found by chance", "found"
-    return _choose_own_rays(needs.mirror_noise, needs.spp, MIRROR_COST, *words)
+        return 0, False, []
+    noise, subject = needs.mirror_noise, "light mirrored by glass"
+    count, gain, choice = _choose_own_rays(noise.own, needs.spp, MIRROR_COST, subject, "found by chance", "found")
+    kept = noise.own.paths / (noise.kept * KEPT_COST) if noise.kept > 0 else 0.0
+    if kept < max(gain, MIN_OWN_GAIN):
+        return count, False, [choice]
+    why = f"lamps in mirrors have much of the noise of paths in a preview: the same error {kept:.2g} times as fast"
+    how = "lamps in it found by one ray that a path keeps of all that glass mirrors, in images"
+    return 0, True, [Choice(subject, how, why)]
 
 
 def _choose_own_rays(
     noise: OwnRaysNoise, spp: int, cost: float, subject: str, without: str, verb: str
-) -> tuple[int, list[Choice]]:
-    """Choose the number of own camera rays of a pixel with the least variance x time; 0 for none.
+) -> tuple[int, float, Choice]:
+    """Choose the number of own camera rays of a pixel with the least variance x time, 0 for none; also returns the gain.
 
     Args:
         noise: measured variances.
@@ -549,9 +564,9 @@ def _choose_own_rays(
     ratio = noise.paths / noise.rest if noise.rest > 0 else math.inf
     share = f"with it, paths have {ratio:.2g} times the noise of all other light in a preview"
     if gain < MIN_OWN_GAIN:
-        return 0, [Choice(subject, without, share)]
+        return 0, 1.0, Choice(subject, without, share)
     why = f"{share}: the same error {gain:.2g} times as fast"
-    return best, [Choice(subject, f"{verb} along {best} camera rays of its own a pixel, in images", why)]
+    return best, gain, Choice(subject, f"{verb} along {best} camera rays of its own a pixel, in images", why)
 
 
 def _explain_missing_lamp_rays(needs: Needs, settings: Settings) -> str | None:

@@ -35,6 +35,7 @@ from mivol.scene.survey import (
     OUTSIDE_SHAPES,
     Boundary,
     BranchNoise,
+    MirrorNoise,
     OwnRaysNoise,
     SceneSurvey,
     ShapeFacts,
@@ -403,7 +404,7 @@ class Needs(ShapeFacts):
         emission_noise: what a preview measures of the light of media seen directly (:class:`OwnRaysNoise`); None before a
             measurement.
         branch_noise: what a preview measures of paths that branch (:class:`BranchNoise`); None before a measurement.
-        mirror_noise: what a preview measures of the light that glass mirrors to the camera; None before a measurement.
+        mirror_noise: measured noise of the light mirrored by glass (:class:`MirrorNoise`); None before a measurement.
         media_light: the light that media emit; None without such light, without scattering, or if the light could not be read.
     """
 
@@ -425,7 +426,7 @@ class Needs(ShapeFacts):
     lamp_noise: tuple[float, float] | None = None
     emission_noise: OwnRaysNoise | None = None
     branch_noise: BranchNoise | None = None
-    mirror_noise: OwnRaysNoise | None = None
+    mirror_noise: MirrorNoise | None = None
     media_light: MediaLight | None = None
 
     @property

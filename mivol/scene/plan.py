@@ -63,6 +63,7 @@ from mivol.scene.survey import SceneSurvey
 from mivol.transport.estimators.flights.flight_derivatives import MIN_ALBEDO
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.lighting.emission_sampling import EmissionSampling, EmissionTable
+from mivol.transport.estimators.lighting.kept_rays import MirroredEmitters
 from mivol.transport.estimators.lighting.tabulated_shadows import TransmittanceGrid
 from mivol.transport.estimators.single_scattering.near_light import NearLighting
 from mivol.transport.estimators.single_scattering.single_scattering import PROBE_DEPTH
@@ -124,6 +125,7 @@ class Plan:
         shadow_nodes: nodes along an edge of the table of shadows, in images; 0 for shadow rays.
         emission_rays: own camera rays of a pixel for the light of media that does not scatter, in images; 0 for none.
         mirror_rays: own camera rays of a pixel for the light that glass mirrors to the camera, in images; 0 for none.
+        keeps_mirrors: whether paths find lamps in mirrors by kept rays, in images.
         lamp_rays: own camera rays a sample for the light of lamps seen directly, in images; 0 for none.
         occupied: share of occupied blocks of the first medium's grid, in steps of ``OCCUPIED_STEP`` [1]; None if unknown.
     """
@@ -151,6 +153,7 @@ class Plan:
     shadow_nodes: int
     emission_rays: int
     mirror_rays: int
+    keeps_mirrors: bool
 
     @property
     def decisions(self) -> tuple:
@@ -272,7 +275,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     choices += why
     emission_rays, why = choose_emission_rays(needs, settings, segment)
     choices += why
-    mirror_rays, why = choose_mirror_rays(needs, settings, segment)
+    mirror_rays, keeps_mirrors, why = choose_mirror_rays(needs, settings, segment)
     choices += why
     nodes, why = choose_shadow_table(needs, settings, segment)
     choices += why
@@ -300,6 +303,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         nodes,
         emission_rays,
         mirror_rays,
+        keeps_mirrors,
     )
 
 
@@ -456,7 +460,12 @@ def build_estimators(
     if draws_near_light:
         inside = [scene.emitters()[number] for number in plan.near_emitters]
         near = NearLighting(direct, 0.0 if for_images else PROBE_DEPTH, inside)
-    return Estimators(direct, segment, settings, lights_surfaces, lights_media, lobe, emission, long_paths_count, near)
+    mirrored = None
+    if for_images and plan.keeps_mirrors:
+        with dr.suspend_grad():
+            mirrored = MirroredEmitters(scene, direct.emitters)
+    ways = lobe, emission, long_paths_count, near, mirrored
+    return Estimators(direct, segment, settings, lights_surfaces, lights_media, *ways)
 
 
 def _make_emission_sampling(scene: mi.Scene, media: SceneMedia, needs: Needs) -> EmissionSampling:

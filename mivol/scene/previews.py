@@ -29,7 +29,8 @@ the noise of collisions near an emitter is large in few cells.
 **Emission in view.** :func:`measure_emission_noise` measures the variance of pixels with and without the light that media emit
 towards the camera, and of this light along camera rays of its own.
 
-**Mirrors.** :func:`measure_mirror_noise` measures the same of the light that the first glass of a camera ray mirrors.
+**Mirrors.** :func:`measure_mirror_noise` measures the same of the light mirrored by the first glass of a camera ray, and the
+variance of paths with a kept mirrored ray.
 
 **Branches.** :func:`measure_branch_noise` measures the variance of pixels with one and with several branches of a path. With k
 branches it is A + B / k, so two numbers of branches tell the noise A of stems and B of branches.
@@ -61,8 +62,9 @@ from mivol.scene.choices import (
 from mivol.scene.media_light import SAMPLING_COST
 from mivol.scene.needs import Needs, find_needs
 from mivol.scene.plan import Plan, build_estimators, choose_segment, make_plan
-from mivol.scene.survey import BranchNoise, OwnRaysNoise, SceneSurvey, survey_scene
+from mivol.scene.survey import BranchNoise, MirrorNoise, OwnRaysNoise, SceneSurvey, survey_scene
 from mivol.scene_graph import traverse
+from mivol.transport.estimators.lighting.kept_rays import MirroredEmitters
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.successive import walk_branching
@@ -304,14 +306,14 @@ def measure_emission_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, sur
 
 
 def measure_mirror_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> Needs:
-    """Measure the noise of the light that the first glass of a camera ray mirrors, by chance and by camera rays of its own.
+    """Measure the noise of the light mirrored by glass: by chance, by own camera rays, and by kept rays.
 
     Arguments as for :func:`measure_media_light`; ``survey`` keeps the variances of each sensor.
 
     Returns:
         The needs with the variances.
 
-    Cost: 3 x 16384 paths once, and three kernels.
+    Cost: 4 x 16384 paths once, and four kernels.
     """
     if not _is_measurable(sensor) or not is_mirror_noise_open(needs, settings, choose_segment(needs, settings)):
         return needs
@@ -320,7 +322,11 @@ def measure_mirror_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, surve
             plan = make_plan(needs, settings)
             estimators = plan.light_of_paths(build_estimators(scene, needs, plan, settings, survey, for_images=True))
             ways = estimators, replace(estimators, glass="transmits"), estimators.of_mirrors()
-            survey.mirror_noise[sensor.ptr] = OwnRaysNoise(*(_measure_pixel_variance(sensor, way) for way in ways))
+            own, kept = OwnRaysNoise(*(_measure_pixel_variance(sensor, way) for way in ways)), math.inf
+            if not any(m.bounded or m.has_own_walk for m in needs.media):
+                mirrored = MirroredEmitters(scene, estimators.direct.emitters)
+                kept = _measure_pixel_variance(sensor, replace(estimators, mirrored=mirrored))
+            survey.mirror_noise[sensor.ptr] = MirrorNoise(own, kept)
     return replace(needs, mirror_noise=survey.mirror_noise[sensor.ptr])
 
 

@@ -69,6 +69,19 @@ class OwnRaysNoise:
     rays: float
 
 
+@dataclass(frozen=True)
+class MirrorNoise:
+    """Noise of the light mirrored by glass, measured by a preview: variances in a pixel, for one sample.
+
+    Attributes:
+        own: of paths, and of own camera rays for the light mirrored by the first glass.
+        kept: of paths with a kept mirrored ray; infinite without exact transmittances.
+    """
+
+    own: OwnRaysNoise
+    kept: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class ShapeFacts:
     """The facts about shapes and emitters.
@@ -163,7 +176,7 @@ class SceneSurvey:
     lamp_noise: dict[int, tuple[float, float]] = field(default_factory=dict)
     emission_noise: dict[int, OwnRaysNoise] = field(default_factory=dict)
     branch_noise: dict[int, BranchNoise] = field(default_factory=dict)
-    mirror_noise: dict[int, OwnRaysNoise] = field(default_factory=dict)
+    mirror_noise: dict[int, MirrorNoise] = field(default_factory=dict)
 
     @property
     def usable_tracer(self) -> mi.Scene | None:

@@ -14,7 +14,8 @@ import mitsuba as mi
 from mivol.transport.estimators.flights.free_flight import FreeFlight
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.lighting.emission_sampling import EmissionSampling
-from mivol.transport.estimators.lighting.tabulated_shadows import TransmittanceGrid
+from mivol.transport.estimators.lighting.kept_rays import KeptMirror, KeptRay, MirroredEmitters
+from mivol.transport.estimators.lighting.tabulated_shadows import KeptShadow, TransmittanceGrid
 from mivol.transport.estimators.segment import Absorption, SegmentEstimator, TrackedAbsorption
 from mivol.transport.estimators.single_scattering.near_light import NearLighting
 from mivol.transport.estimators.single_scattering.scattering_quadrature import ScatteringQuadrature
@@ -245,6 +246,7 @@ class Estimators:
             camera rays of its own.
         glass: what the first smooth glass of a camera ray does to it: "any" by chance, "transmits", or "mirrors"; the light of
             the last two adds up to that of the first.
+        mirrored: guesses of the light in mirrors, for kept rays (:mod:`.kept_rays`); None to find lamps in mirrors by chance.
         shows: emitters that the camera sees directly: "all", the "lamps" (emitters with a surface), or the "rest".
         media: media of the scene.
         draws_shadows: shadow rays of vertices are estimated, by tracking or by roulette, with a random number.
@@ -259,6 +261,7 @@ class Estimators:
     emission: EmissionSampling | None = None
     long_paths_count: bool = False
     near: NearLighting | None = None
+    mirrored: MirroredEmitters | None = None
     shows: str = "all"
     camera_emission: mi.Float | float = 1.0
     glass: str = "any"
@@ -274,10 +277,14 @@ class Estimators:
         """Whether emitter samples light the collisions in media: not if segments draw the light of all sampled emitters."""
         return self.lights_media and (self.near is None or self.near.lights_vertices)
 
-    @property
-    def tabulates_shadows(self) -> bool:
-        """Whether a path keeps a shadow ray of its vertices."""
-        return self.segment.ends_in_media and self.direct.shadow_table is not None
+    def start_kept_rays(self, n: int) -> dict[str, KeptRay]:
+        """Rays kept by paths, by name of the path's attribute: a shadow ray of vertices in media, and a mirrored ray."""
+        kept: dict[str, KeptRay] = {}
+        if self.segment.ends_in_media and self.direct.shadow_table is not None:
+            kept["tabulated"] = KeptShadow.empty(n)
+        if self.mirrored is not None:
+            kept["mirror"] = KeptMirror.empty(n)
+        return kept
 
     def is_shown(self, si: mi.SurfaceInteraction3f) -> mi.Bool | bool:
         """Whether the camera sees the emitter at the end of its ray."""

@@ -15,7 +15,7 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.traversal.rays import FineRay, Ray, spawn_ray
 
-__all__ = ["GLASS", "DirectionSamples", "NextDirection", "PathEvent", "is_glass", "sample_next_direction"]
+__all__ = ["GLASS", "DirectionSamples", "NextDirection", "PathEvent", "is_glass", "mirror_ray", "sample_next_direction"]
 
 
 # -- The end of a segment ------------------------------------------------------------------------------------------------
@@ -79,8 +79,9 @@ TRANSMISSION = int(
 """Flags of BSDFs that transmit light."""
 
 
-ALMOST_ONE = 1 - 2**-24
-"""Largest float32 below 1."""
+ALMOST_ONE, MIRRORS = 1 - 2**-24, 0.0
+"""Largest float32 below 1, and the smallest. Mitsuba's glass mirrors for numbers up to the reflectance, and then its density is
+the reflectance."""
 
 GLASS = tuple(int(mi.BSDFFlags.DeltaReflection) | int(kind) for kind in (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null))
 """Flags of the BSDFs that only mirror and transmit."""
@@ -90,6 +91,23 @@ def is_glass(si: mi.SurfaceInteraction3f) -> mi.Bool:
     """Whether a surface only mirrors and transmits."""
     components = si.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.All))
     return (components == GLASS[0]) | (components == GLASS[1])
+
+
+def mirror_ray(
+    media: SceneMedia, event: PathEvent, active: mi.Bool
+) -> tuple[mi.Ray3f, mi.MediumPtr, mi.Spectrum, mi.Float]:
+    """The ray mirrored by smooth glass at the end of a segment.
+
+    Returns:
+        The ray, the medium around the origin of the ray, the mirrored share of the light [1], and the probability of mirroring
+        a path [1]; 0 in inactive lanes.
+    """
+    si = event.si
+    sample, weight = si.bsdf().sample(mi.BSDFContext(), si, mi.Float(MIRRORS), mi.Point2f(0.5), active)
+    on = active & mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaReflection)
+    ray = spawn_ray(si, si.to_world(sample.wo), media.size)
+    medium = dr.select(si.is_medium_transition(), si.target_medium(ray.d), event.medium)
+    return ray, medium, dr.select(on, weight * sample.pdf, 0), dr.select(on, sample.pdf, 0)
 
 
 # -- The direction onwards -----------------------------------------------------------------------------------------------
@@ -109,6 +127,7 @@ class NextDirection:
         origin: interaction at which the direction was sampled.
         on: lanes that continue.
         through: lanes passing a surface without deviation.
+        mirrored: lanes mirrored by a surface.
         factors: BSDF and phase function with their derivatives.
     """
 
@@ -121,6 +140,7 @@ class NextDirection:
     origin: mi.Interaction3f
     on: mi.Bool
     through: mi.Bool
+    mirrored: mi.Bool
     factors: list[TrackedFactor]
 
 
@@ -142,7 +162,7 @@ class DirectionSamples:
     splits: mi.Bool | None = None
 
 
-PER_LANE = ("ray", "medium", "weight", "pdf", "delta", "eta", "origin", "on", "through")
+PER_LANE = ("ray", "medium", "weight", "pdf", "delta", "eta", "origin", "on", "through", "mirrored")
 """Attributes of :class:`NextDirection` with a value for each lane."""
 
 
@@ -176,8 +196,7 @@ def _sample_bsdf(
     bsdf = si.bsdf()
     component, mirrors = samples.component, estimators.glass == "mirrors"
     if samples.splits is not None:
-        # Mitsuba's glass mirrors for numbers up to the reflectance, and then its density is the reflectance.
-        component = dr.select(samples.splits, 0 if mirrors else ALMOST_ONE, component)
+        component = dr.select(samples.splits, MIRRORS if mirrors else ALMOST_ONE, component)
     sample, weight = bsdf.sample(mi.BSDFContext(), si, component, samples.direction, event.at_surface)
     if samples.splits is not None:
         is_mirrored = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaReflection)
@@ -200,6 +219,7 @@ def _sample_bsdf(
         origin=mi.Interaction3f(si),
         on=on,
         through=through,
+        mirrored=mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaReflection),
         factors=[TrackedFactor(lambda: bsdf.eval(mi.BSDFContext(), si, sample.wo, on & ~through), on & ~through)],
     )
 
@@ -245,5 +265,6 @@ def _sample_phase_function(
         origin=mi.Interaction3f(mei),
         on=on,
         through=dr.full(mi.Bool, False, n),
+        mirrored=dr.full(mi.Bool, False, n),
         factors=[TrackedFactor(lambda: MediumVertex(media, mei, collision.p).eval(wo, on), on)],
     )

@@ -24,7 +24,6 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.estimators.flights.free_flight import make_collision
-from mivol.transport.estimators.lighting.tabulated_shadows import KeptShadow
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.estimators.segment import KnownFlight
 from mivol.transport.path.estimators import Estimators
@@ -99,7 +98,7 @@ def walk_successively(
     starts = leave_camera(estimators, sampler.clone(), ray)
     # Each path writes its own results once.
     L, alpha = dr.empty(mi.Spectrum, n), dr.empty(mi.Float, n)
-    kept = KeptShadow.empty(n) if estimators.tabulates_shadows else None
+    kept = estimators.start_kept_rays(n)
     dr.eval(starts, L, alpha, kept)
 
     def start(index: mi.UInt32, active: mi.Bool) -> Path:
@@ -111,8 +110,8 @@ def walk_successively(
         ended = asks & (index != NONE_YET)
         dr.scatter(L, path.score.L, index, ended)
         dr.scatter(alpha, film_alpha(path), index, ended)
-        if kept is not None:
-            kept.scatter(path.tabulated, index, ended)
+        for name, rays in kept.items():
+            rays.scatter(getattr(path, name), index, ended)
         following, begins = paths.take(asks)
         index = dr.select(asks, following, index)
         return dr.select(asks, start(index, begins), path), index, path.active | begins
@@ -121,9 +120,9 @@ def walk_successively(
     index, on = dr.full(mi.UInt32, NONE_YET, lanes), dr.full(mi.Bool, True, lanes)
     dr.while_loop(state=(start(index, ~on), index, on), cond=lambda *state: state[-1], body=advance, label="successive paths")
     dr.eval(L, alpha, kept)
-    if kept is not None:
-        # Here every lane has one shadow ray, and none waits for the longer path of another.
-        L += kept.light_at_camera(estimators.media, starts.ray)
+    for rays in kept.values():
+        # Here every lane has one ray, and none waits for the longer path of another.
+        L += rays.light_at_camera(estimators.media, starts.ray)
     return L, alpha
 
 
@@ -152,7 +151,7 @@ def walk_branching(
     collided, found = dr.zeros(mi.UInt32, n), _WorkList(dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, 0))
     dr.scatter(collided, dr.arange(mi.UInt32, n), *found.take(ends.active))
     L, events = dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n)
-    kept = KeptShadow.empty(n) if estimators.tabulates_shadows else None
+    kept = estimators.start_kept_rays(n)
     dr.eval(light, alpha, ends, found.taken, collided, L, events, kept)
     lanes, each = -(-n // paths_per_lane(BRANCHED_PATHS, n)), dr.opaque(mi.UInt32, count)
     todo = _WorkList(found.taken, dr.opaque(mi.UInt32, 0))
@@ -172,16 +171,16 @@ def walk_branching(
         ended = asks & (stem != NONE_YET)
         dr.scatter(L, path.score.L, stem, ended)
         dr.scatter(events, path.depth, stem, ended)
-        if kept is not None:
-            kept.scatter(path.tabulated, stem, ended)
+        for name, rays in kept.items():
+            rays.scatter(getattr(path, name), stem, ended)
         # -- The next branch ---------------------------------------------------------------------------------------------
         place, begins = todo.take(asks)
         stem = dr.select(asks, dr.gather(mi.UInt32, collided, place, begins), stem)
         branch = dr.select(asks, 0, dr.select(next_one, branch + 1, branch))
         begins |= next_one & ~asks
         fresh, at_collision = start(stem, branch, begins, Primal(dr.select(asks, 0, path.score.L)))
-        if kept is not None:
-            fresh.tabulated = dr.select(asks, fresh.tabulated, path.tabulated)
+        for name in kept:
+            setattr(fresh, name, dr.select(asks, getattr(fresh, name), getattr(path, name)))
         on = path.active | begins
         return dr.select(next_one, fresh, path), dr.select(next_one, at_collision, begun), stem, branch, on
 
@@ -191,6 +190,6 @@ def walk_branching(
     path, begun = start(stem, branch, ~on, Primal(dr.zeros(mi.Spectrum, lanes)))
     dr.while_loop(state=(path, begun, stem, branch, on), cond=lambda *state: state[-1], body=advance, label="branches")
     dr.eval(L, events, kept)
-    if kept is not None:
-        L += kept.light_at_camera(estimators.media, ray)
+    for rays in kept.values():
+        L += rays.light_at_camera(estimators.media, ray)
     return light + L * dr.rcp(mi.Float(each)), alpha, events

@@ -32,6 +32,8 @@ from mivol.transport.estimators.lighting.direct_lighting import (
     EmitterSample,
     power_heuristic,
 )
+from mivol.transport.estimators.lighting.emitters import is_among
+from mivol.transport.estimators.lighting.kept_rays import LARGEST_REFLECTANCE, KeptMirror
 from mivol.transport.estimators.lighting.tabulated_shadows import KeptShadow
 from mivol.transport.estimators.scores import IMAGE, Primal, Replay, Tangent, TrackedTerm
 from mivol.transport.estimators.segment import Collision, KnownFlight, PathSegment
@@ -39,7 +41,7 @@ from mivol.transport.estimators.single_scattering.near_light import AimedDirecti
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.extinction import to_components
 from mivol.transport.path.estimators import Estimators
-from mivol.transport.path.event import DirectionSamples, PathEvent, is_glass, sample_next_direction
+from mivol.transport.path.event import DirectionSamples, PathEvent, is_glass, mirror_ray, sample_next_direction
 from mivol.transport.path.side_flight import (
     SideFlightSamples,
     WeightedEmitterSample,
@@ -115,6 +117,8 @@ class Path:
         left_medium: lanes in which ``last`` is a point of a medium; None if vertices draw the light of near emitters.
         known: flights of camera rays, for the first segment of the path, and the collisions at which stems have stopped; None
             if all flights are drawn with the segment.
+        mirror: kept ray mirrored by glass; None if mirrored paths find lamps by chance.
+        mirrored: lanes mirrored by the last event, with the mirrored ray offered to ``mirror``; None without ``mirror``.
         met_glass: lanes that have met smooth glass; None if chance decides what glass does (``Estimators.glass``).
     """
 
@@ -139,6 +143,8 @@ class Path:
     left_medium: mi.Bool | None = None
     known: KnownFlight | None = None
     met_glass: mi.Bool | None = None
+    mirror: KeptMirror | None = None
+    mirrored: mi.Bool | None = None
 
 
 @dataclass
@@ -237,7 +243,8 @@ def start_path(
         sampler=sampler,
         emission_pdf=None if estimators.emission is None else dr.zeros(mi.Float, n),
         left_medium=None if estimators.near is None else dr.full(mi.Bool, False, n),
-        tabulated=KeptShadow.empty(n) if estimators.tabulates_shadows else None,
+        **estimators.start_kept_rays(n),
+        mirrored=None if estimators.mirrored is None else dr.full(mi.Bool, False, n),
         met_glass=None if estimators.glass == "any" else dr.full(mi.Bool, False, n),
     )
 
@@ -485,6 +492,9 @@ def _add_emitted_light(estimators: Estimators, path: Path, event: PathEvent) -> 
     scene, si = estimators.media.scene, event.si
     visible = path.active & ~event.in_medium & ((path.depth > 0) | estimators.is_shown(si))
     emitter = si.emitter(scene, visible)
+    if path.mirrored is not None:
+        # Kept rays pass lamps on surfaces that let light through.
+        visible &= ~path.mirrored | is_among(estimators.direct.emitters.transmissive, emitter)
     w_mis = mi.Float(1)
     if estimators.lights_surfaces or estimators.lights_media:
         direct = mi.DirectionSample3f(scene, si, path.last)
@@ -530,6 +540,11 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
         aimed = aim_at_emitter(estimators, emitter_sample, path.beta, sampler.next_1d(arrives), flies_aside)
         path = _add_side_flight(estimators, path, event, emitter_sample, aimed, flies_aside)
 
+    # -- What glass mirrors --------------------------------------------------------------------------------------------
+    offered = None
+    if path.mirror is not None:
+        path, offered = _offer_mirror(estimators, path, event, may_scatter)
+
     # -- The next direction --------------------------------------------------------------------------------------------
     samples = DirectionSamples(sampler.next_1d(arrives), sampler.next_2d(arrives), splits=splits)
     if path.emitter_sample is not None:
@@ -554,6 +569,8 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
     scatters = onward.on & ~onward.through
     path.last = dr.select(scatters, onward.origin, path.last)
     path.pdf = dr.select(scatters, onward.pdf, path.pdf)
+    if offered is not None:
+        path.mirrored = dr.select(scatters, offered & onward.mirrored, path.mirrored)
     path.delta = dr.select(scatters, onward.delta, path.delta)
     if path.emission_pdf is not None:
         samples_emission = event.in_medium | ~onward.delta
@@ -576,6 +593,18 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
     path.beta = dr.select(is_late, path.beta * dr.rcp(dr.maximum(q, 1e-30)), path.beta)
     path.active = onward.on & survives & dr.any(path.beta != 0)
     return path
+
+
+def _offer_mirror(estimators: Estimators, path: Path, event: PathEvent, may_scatter: mi.Bool) -> tuple[Path, mi.Bool]:
+    """Offer the ray mirrored by smooth glass to the reservoir of a path; also returns the lanes with an offered ray."""
+    at_glass = may_scatter & event.at_surface & is_glass(event.si)
+    ray, medium, share, chance = mirror_ray(estimators.media, event, at_glass)
+    at_glass &= chance < LARGEST_REFLECTANCE
+    light = path.beta * share
+    weight = dr.select(at_glass, dr.max(light * estimators.mirrored.guess(ray, at_glass)), 0)
+    kept = mi.Point3d(ray.o), mi.Point3f(ray.d), medium, light
+    path.mirror = path.mirror.add(kept, weight, path.sampler.next_1d(at_glass))
+    return path, at_glass
 
 
 # -- Direct light --------------------------------------------------------------------------------------------------------
@@ -734,9 +763,9 @@ def _start_reservoirs(estimators: Estimators, path: Path, *probes: str) -> Path:
 
 def _add_reservoirs(estimators: Estimators, path: Path) -> Path:
     """Add the derivatives at the kept points and along the kept shadow ray, and its light in images, at the end of a path."""
-    if path.tabulated is not None:
-        light = path.tabulated.light_at_camera(estimators.media, path.ray)
-        path.score = path.score.add(TrackedTerm(light, mi.Bool(True)))
+    for kept in (path.tabulated, path.mirror):
+        if kept is not None:
+            path.score = path.score.add(TrackedTerm(kept.light_at_camera(estimators.media, path.ray), mi.Bool(True)))
     if path.shadow is not None:
         path.score = path.score.add(ShadowTerm(estimators.media, path.shadow))
     if path.probes is not None:

@@ -83,6 +83,7 @@ class SceneEmitters:
         self.transmissive = [e for e in self.sampled if _is_transmissive(e)]
         opaque = [e for e in emitters if not any(e is emitter for emitter in self.transmissive)]
         self.samples_phase = any(not int(e.flags()) & delta for e in opaque)
+        self._placed = placed
         self._balls = [ball for e, ball in placed if e.class_name() != UNIFORM_EMITTER]
         self.is_near = any(ball is not None for ball in self._balls)
         self._from_camera = from_camera
@@ -101,6 +102,10 @@ class SceneEmitters:
     def bounding_ball(self, number: int) -> list[mi.Float] | None:
         """Centre and radius of a ``sampled`` emitter [length]; None if the emitter is at infinity."""
         return self._balls[number]
+
+    def find_ball(self, emitter: mi.Emitter) -> list[mi.Float] | None:
+        """Centre and radius of an emitter [length]; None at infinity."""
+        return next(ball for e, ball in self._placed if e is emitter or e.ptr == emitter.ptr)
 
     def draw_event_samples(self, sampler: mi.Sampler | SpreadSampler, active: mi.Bool) -> EventSamples:
         """Draw the random numbers of a scattering event."""

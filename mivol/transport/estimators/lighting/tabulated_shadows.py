@@ -16,13 +16,14 @@ References: Chao 1982 (weighted reservoir sampling); Talbot et al. 2005 (resampl
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mivol.transport.estimators.lighting.emitters import SceneEmitters
+from mivol.transport.estimators.lighting.kept_rays import KeptRay
 from mivol.transport.estimators.lighting.shadow_rays import NEGLIGIBLE_TAU, trace_shadow_ray
 from mivol.transport.media.extinction import to_spectrum
 from mivol.transport.media.scene_media import SceneMedia
@@ -292,65 +293,18 @@ class TabulatedShadow:
         return replace(self, light=self.light * factor)
 
 
-@dataclass
-class KeptShadow:
-    """The shadow ray that a path keeps of its vertices (weighted reservoir sampling).
-
-    Attributes:
-        p, target, medium: as of :class:`TabulatedShadow`.
-        light: light f of the vertex at the camera without its shadow [radiance].
-        weight: reservoir weight of the vertex.
-        total: total weight of the vertices so far.
-    """
-
-    p: mi.Point3d
-    target: mi.Point3f
-    medium: mi.MediumPtr
-    light: mi.Spectrum
-    weight: mi.Float
-    total: mi.Float
-
-    @classmethod
-    def empty(cls, n: int) -> KeptShadow:
-        """A reservoir of ``n`` lanes before the first vertex."""
-        return cls(**{name: dr.zeros(kind, n) for name, kind in _kinds().items()})
+class KeptShadow(KeptRay):
+    """A kept shadow ray of a vertex; ``aim`` is the point of the emitter."""
 
     def offer(self, shadow: TabulatedShadow, chance: mi.Float, active: mi.Bool) -> KeptShadow:
         """Offer another vertex, with its light at the camera; ``chance`` is uniform in [0, 1)."""
         weight = dr.select(active, dr.max(shadow.light) * shadow.T, 0)
-        total = self.total + weight
-        keep = chance * total < weight
-        return KeptShadow(
-            dr.select(keep, shadow.p, self.p),
-            dr.select(keep, shadow.target, self.target),
-            dr.select(keep, shadow.medium, self.medium),
-            dr.select(keep, shadow.light, self.light),
-            dr.select(keep, weight, self.weight),
-            total,
-        )
-
-    def scatter(self, values: KeptShadow, index: mi.UInt32, active: mi.Bool) -> None:
-        """Write the reservoirs of lanes that are ``active`` to the lanes ``index``."""
-        for field in fields(self):
-            dr.scatter(getattr(self, field.name), getattr(values, field.name), index, active)
+        return self.add((shadow.p, shadow.target, shadow.medium, shadow.light), weight, chance)
 
     def light_at_camera(self, media: SceneMedia, ray: Ray) -> mi.Spectrum:
-        """The light of all vertices at the camera, by the kept shadow ray [radiance].
-
-        Args:
-            media: media and surfaces.
-            ray: a ray of each path, for its time.
-
-        Cost: one shadow ray.
-        """
+        """The light of all vertices at the camera, from the kept shadow ray [radiance]."""
         on = self.weight > 0
         direct = dr.zeros(mi.DirectionSample3f, dr.width(self.weight))
-        direct.p, direct.time = self.target, ray.time
+        direct.p, direct.time = self.aim, ray.time
         _, clear, _, T = trace_shadow_ray(media, self.p, self.medium, direct, on)
-        return dr.select(on & clear, self.light * (self.total / dr.select(on, self.weight, 1)) * T, 0)
-
-
-def _kinds() -> dict[str, type]:
-    """The type of each field of :class:`KeptShadow` in the active variant."""
-    numbers = {"light": mi.Spectrum} | dict.fromkeys(("weight", "total"), mi.Float)
-    return {"p": mi.Point3d, "target": mi.Point3f, "medium": mi.MediumPtr} | numbers
+        return dr.select(clear, self.light_of_all() * T, 0)
