@@ -66,7 +66,7 @@ def test_a_recorded_picture_follows_the_lamp() -> None:
     """The lamp leaves the mirror and comes back, between pictures of one recording, which reads where lamps are."""
     scene, cosine = pane({"type": "diffuse", "reflectance": 0.0})
     ours, params = mi.load_dict(mivol(max_depth=3)), mi.traverse(scene)
-    key = next(k for k in params if k.startswith("lamp") and k.endswith("to_world"))
+    key = "lamp.to_world"
     place = mi.Transform4f(params[key])
     for away, light in ((0.0, reflectance(cosine) * RADIANCE), (30.0, 0.0), (0.0, reflectance(cosine) * RADIANCE)):
         params[key] = mi.Transform4f().translate([0, 0, away]) @ place
@@ -88,7 +88,7 @@ def test_no_ray_that_meets_a_lamp_has_the_weight_0() -> None:
     dark = np.zeros((8, 8, 3), np.float32)
     dark[::2] = 2.0
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(dark), "raw": True, "filter_type": "nearest"}
-    place = mi.ScalarTransform4f().translate([3, 0, 1]).rotate([1, 1, 0], 40).scale([0.5, 0.1, 2.0])
+    place = mi.ScalarTransform4f().translate([3, 0, 1]).rotate([0.6, 0.8, 0], 40).scale([0.5, 0.1, 2.0])
     lamps = {
         "box": {"type": "cube", "to_world": place, "emitter": {"type": "area", "radiance": texture}},
         "ball": {"type": "sphere", "center": [-2, 1, 0], "radius": 0.3, "emitter": {"type": "area", "radiance": 1e-3}},

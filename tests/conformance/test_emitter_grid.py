@@ -133,9 +133,9 @@ def test_the_density_of_a_direction_is_the_density_of_its_sample() -> None:
     it, k = dr.zeros(mi.Interaction3f, n), dr.arange(mi.Float, n)
     it.p = mi.Point3f(*(dr.sin(k * step) for step in (1.1, 2.3, 3.7)))
     u = mi.Point2f((k + 0.5) / n, k * 0.618034 - dr.floor(k * 0.618034))
-    direct, _, emitter, _ = found.sample_direction(it, u, mi.Bool(True))
-    again = found.pdf_direction(it, direct, mi.Bool(True))
-    panel = np.array(~direct.delta & (direct.pdf > 0) & (emitter == direct.emitter))
+    draw = found.sample_direction(it, u, mi.Bool(True))
+    direct, again = draw.direct, found.pdf_direction(it, draw.direct, mi.Bool(True))
+    panel = np.array(~direct.delta & (direct.pdf > 0) & (draw.emitter == direct.emitter))
     assert panel.sum() > 100
     np.testing.assert_allclose(np.array(again)[panel], np.array(direct.pdf)[panel], rtol=ROUNDING)
 

@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scattering_scenes as small
-from scattering_scenes import close_up, mivol, moments, rough_grid, smoke
+from false_alarms import Estimate, assert_same_mean
+from scattering_scenes import assert_same_images, close_up, mivol, moments, rough_grid, smoke
 from volpath_scenes import EMITTERS, same
 
 from mivol.transport.estimators.lighting.emitters import EquiangularSampler, EventSamples, SceneEmitters, make_ball_sampler
@@ -151,3 +152,74 @@ def test_mean_of_the_inverse_square():
     assert found[0] == pytest.approx(np.arctan(1) / 9, rel=1e-5)  # 4e-12 of the squared distance is added to rho^2
     assert make_ball_sampler(ray, None) is None
     assert EquiangularSampler(mi.Float(0), mi.Float(1), mi.Bool(False)).mean(mi.Float(4), mi.Float(3))[0] == 1
+
+
+# -- Lamps with hidden sides ------------------------------------------------------------------------------------------------
+
+
+def box_lamp(radiance: float = 2.0, at: tuple = (0.6, -0.4, 2.0)) -> dict:
+    """A flat box, turned, that shines from all its sides; by default above a smoke."""
+    place = mi.ScalarTransform4f().translate(list(at)).rotate([0.6, 0.8, 0], 50).scale([0.5, 0.3, 0.1])
+    black = {"type": "diffuse", "reflectance": 0.0}
+    return {"type": "cube", "to_world": place, "bsdf": black, "emitter": {"type": "area", "radiance": radiance}}
+
+
+def solid_angle(vertices: np.ndarray, faces: np.ndarray, p: np.ndarray) -> float:
+    """Of a convex mesh, in float64 (van Oosterom and Strackee 1983): its near side and its far side have the same."""
+    a, b, c = (vertices[faces[:, k]] - p for k in range(3))
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c))
+    x, y, z = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    dots = [np.einsum("ij,ij->i", u, v) for u, v in ((a, b), (b, c), (c, a))]
+    angles = 2 * np.arctan2(volume, x * y * z + dots[0] * z + dots[1] * x + dots[2] * y)
+    return float(np.abs(angles).sum() / 2)
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("p", [(0.0, 0.0, 0.0), (1.3, 0.6, 1.5), (-3.0, 1.0, 6.0)])
+def test_the_light_of_a_box_is_its_solid_angle(p: tuple) -> None:
+    """One point of four has the mean of all, less than half of the variance, and Mitsuba's density for the power heuristic."""
+    scene, n = mi.load_dict({"type": "scene", "lamp": box_lamp(2.0)}), 1 << 16
+    (shape,) = scene.shapes()
+    params = mi.traverse(shape)
+    vertices, faces = (np.array(params[k]).reshape(-1, 3) for k in ("vertex_positions", "faces"))
+    found, it = SceneEmitters(scene), dr.zeros(mi.Interaction3f, n)
+    it.p = mi.Point3f(*p)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(3, n)
+    u, on = sampler.next_2d(), dr.full(mi.Bool, True, n)
+    draw = found.sample_direction(it, u, on)
+    light, alone = (np.array(w.x, np.float64) for w in (draw.weight, scene.emitters()[0].sample_direction(it, u, on)[1]))
+    truth = 2.0 * solid_angle(vertices.astype(np.float64), faces.astype(int), np.array(p))
+    assert_same_mean(Estimate(light.mean(), light.var(ddof=1) / n, n), truth, rounding=1e-5 * truth, what="the light of a box")
+    assert light.var() < 0.5 * alone.var()
+    lit = light > 0
+    density = np.array(found.pdf_direction(it, draw.direct, on))
+    np.testing.assert_allclose(np.array(draw.density)[lit], density[lit], rtol=1e-4)
+    np.testing.assert_allclose(light[lit], 2.0 / np.array(draw.direct.pdf)[lit], rtol=1e-5)
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("depth", [2, pytest.param(4, marks=pytest.mark.slow)])
+def test_a_box_over_a_smoke_and_a_floor(variant_rgb: str, depth: int) -> None:
+    """The floor close to the box is lit by emitter samples and by directions that meet the box, in about equal parts."""
+    box, _ = smoke(rough_grid(1), name="hg", g=0.4)
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1]).scale(4)}
+    scene, depths = close_up({"smoke": box, "lamp": box_lamp(3.0, (0.9, -0.9, -0.4)), "floor": floor}), {"max_depth": depth}
+    assert_same_images(scene, (64, 256), tile=2, ours=mivol(**depths), stock=small.volpath(**depths), precision=0.01)
+
+
+@pytest.mark.statistical
+def test_the_derivative_by_the_radiance_of_a_box(variant_rgb: str) -> None:
+    """The image is in proportion to the radiance."""
+    box, _ = smoke(rough_grid(1))
+    scene, ours = close_up({"smoke": box, "lamp": box_lamp(30.0)}), mi.load_dict(mivol(max_depth=3))
+    params, means, key = mi.traverse(scene), [], "lamp.emitter.radiance.value"
+    for seed in range(32):
+        dr.enable_grad(params[key])
+        dr.set_grad(params[key], 0)
+        image = dr.mean(mi.render(scene, params, integrator=ours, spp=16, seed=2 * seed, seed_grad=2 * seed + 1), axis=None)
+        dr.backward(image)
+        means.append((float(np.ravel(image)[0]), 30.0 * float(np.sum(dr.grad(params[key])))))
+    image, along = np.array(means).T
+    assert_same_mean(*(Estimate(v.mean(), v.var(ddof=1) / len(v), len(v)) for v in (along, image)), what="along the radiance")
+    assert along.std(ddof=1) / len(along) ** 0.5 < 0.02 * along.mean()

@@ -18,7 +18,7 @@ References: Veach 1997, Eq. 9.13 (the power heuristic).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import drjit as dr
@@ -26,6 +26,7 @@ import mitsuba as mi
 
 from mivol.transport.estimators.lighting.emitters import (
     ChosenEmitter,
+    EmitterDraw,
     EventSamples,
     SceneEmitters,
     is_among,
@@ -90,6 +91,11 @@ class EmitterSample:
     u: mi.Point2f
     has_alternative: mi.Bool | bool
     density: mi.Float | None = None
+
+    @classmethod
+    def from_draw(cls, draw: EmitterDraw, has_alternative: mi.Bool | bool) -> EmitterSample:
+        """The sample of a drawn direction."""
+        return cls(draw.direct, draw.weight, draw.emitter, draw.u, has_alternative, draw.density)
 
 
 @dataclass
@@ -203,14 +209,12 @@ class DirectLighting:
         self, it: mi.Interaction3f, u: mi.Point2f, active: mi.Bool, emitters: SceneEmitters | None = None
     ) -> EmitterSample:
         """Sample a direction from a point towards an emitter, by two uniform random numbers in [0, 1); by default of all."""
-        direct, weight, emitter, u = (emitters or self.emitters).sample_direction(it, u, active)
-        return EmitterSample(direct, weight, emitter, u, True)
+        return EmitterSample.from_draw((emitters or self.emitters).sample_direction(it, u, active), True)
 
     def sample_near_emitter(self, it: mi.Interaction3f, chosen: ChosenEmitter, u: mi.Point2f, active: mi.Bool) -> EmitterSample:
         """Sample a direction from a point of a ray towards an emitter with a position, chosen along the ray."""
-        direct, weight = _sample_chosen_emitter(it, chosen, u, active)
-        density = self.near_emitters.pdf_direction(it, direct, active)
-        return EmitterSample(direct, weight, chosen.emitter, u, True, density)
+        sample = EmitterSample.from_draw(_draw_chosen(self.near_emitters, it, chosen, u, active), True)
+        return replace(sample, density=self.near_emitters.pdf_direction(it, sample.direct, active))
 
     def estimate_at_vertex(
         self, vertex: Vertex, sample: EmitterSample, attached: bool, active: mi.Bool, rng: mi.UInt32 | None = None
@@ -291,9 +295,9 @@ class DirectLighting:
         rngs = [fork_state(samples.generator, k) if estimates else None for k in range(2)]
         if self.emitters.sampled:
             mei = vertex.interaction
-            direct, weight = _sample_chosen_emitter(mei, chosen, samples.emitter, active)
             weighed = ~is_among(self.emitters.transmissive, chosen.emitter) if self.emitters.samples_phase else False
-            sample = EmitterSample(direct, weight, chosen.emitter, samples.emitter, weighed)
+            draw = _draw_chosen(self.emitters, mei, chosen, samples.emitter, active)
+            sample = EmitterSample.from_draw(draw, weighed)
             directs.append(self.estimate_at_vertex(vertex, sample, attached, active, rngs[0]))
         if self.emitters.samples_phase:
             directs.append(self._phase_sample(vertex, chosen, samples, attached, active, rngs[1]))
@@ -329,11 +333,8 @@ class DirectLighting:
         return DirectSample(RaySegment(ray, mei.medium, end.t, True, passages=passages), value, on)
 
 
-def _sample_chosen_emitter(
-    it: mi.Interaction3f, chosen: ChosenEmitter, u: mi.Point2f, active: mi.Bool
-) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """Sample a direction towards a chosen emitter; its density contains the probability of the emitter."""
-    direct, weight = chosen.emitter.sample_direction(it, u, active)
-    probability = chosen.distribution.probability(chosen.number)
-    direct.pdf, weight = direct.pdf * probability, weight / dr.select(probability > 0, probability, 1)
-    return direct, weight
+def _draw_chosen(
+    emitters: SceneEmitters, it: mi.Interaction3f, chosen: ChosenEmitter, u: mi.Point2f, active: mi.Bool
+) -> EmitterDraw:
+    """Draw a direction towards a chosen emitter; its density contains the probability of the emitter."""
+    return emitters.draw_direction(it, chosen.emitter, chosen.distribution.probability(chosen.number), u, active)
