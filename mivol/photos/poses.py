@@ -46,6 +46,9 @@ MIRRORED = (2, 4, 5, 7)
 FULL = 2**24
 """Free space below which COLMAP is said to have filled the disk [byte]."""
 
+FEWEST_POINTS = 30
+"""Points below which a model says nothing: COLMAP asks for as many to find one pose (``abs_pose_min_num_inliers``)."""
+
 FEW = 50
 """Common points below which a pair of photographs is said to have few."""
 
@@ -174,11 +177,12 @@ def find_poses(folder: Path, say: Callable[[str], None] = lambda line: None, is_
             "longest": LONGEST,
         }
         (work / "models").mkdir()
-        models, matches = _run(job, work, say)
+        found, matches = _run(job, work, say)
+        models = [model for model in found if model["points"] >= FEWEST_POINTS]
         faults = _list_faults(matches) + ([] if models else _describe_mirrored(images, names, names))
         if not models:
-            found = f"{len(names)} photographs without enough overlap"
-            raise refusal(folder, found, "photographs that show the same parts from several places", "; ".join(faults) or AGAIN)
+            expected = "photographs that show the same parts from several places"
+            raise refusal(folder, f"{len(names)} photographs without enough overlap", expected, "; ".join(faults) or AGAIN)
         for line in faults:
             say(line)
         poses = _keep(folder, sorted(models, key=lambda model: -len(model["names"])), names, matches)
@@ -231,6 +235,9 @@ def _check_folder(folder: Path, say: Callable[[str], None]) -> tuple[Path, list[
     images, names = list_photographs(folder)
     if unread := list_photographs(folder, UNREAD)[1]:
         say(f"{len(unread)} images are not read as photographs ({name_first(unread)}): save them as PNG or JPEG to use them")
+    if not names and (below := [place.name for place in sorted(images.iterdir()) if list_photographs(place)[1]]):
+        found = f"photographs in folders of it only ({name_first(below)})"
+        raise refusal(folder, found, f"them in {folder / 'images'}", "move these folders there, or name one of them")
     _check_count(folder, len(names), f"in {images}")
     return images, names
 
@@ -238,7 +245,8 @@ def _check_folder(folder: Path, say: Callable[[str], None]) -> tuple[Path, list[
 def _check_count(folder: Path, count: int, words: str) -> None:
     if count < FEWEST:
         found = f"{count} photograph{'s' * (count != 1)} {words}"
-        raise refusal(folder, found, f"at least {FEWEST}, and 20 or more for a fit", "photograph the subject from more sides")
+        way_out = "photograph the subject from more sides" if count else "name the folder that holds them"
+        raise refusal(folder, found, f"at least {FEWEST}, and 20 or more for a fit", way_out)
 
 
 def _leave_out_damaged(folder: Path, images: Path, names: list[str], say: Callable[[str], None]) -> list[str]:

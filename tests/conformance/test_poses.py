@@ -58,7 +58,7 @@ def job(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict:
         models = []
         for k, names in enumerate((["near/e.jpg"], ["a.jpg", "b.png", "near/d.jpg"])):
             model = write_colmap(tmp_path / f"model{k}") / "sparse" / "0"
-            facts = {"error": 0.5, "points": 7, "cameras": 1, "against": asked.get("against", (0, 3))}
+            facts = {"error": 0.5, "points": asked.get("points", 70), "cameras": 1, "against": asked.get("against", (0, 3))}
             models.append({"folder": str(model), "names": names, **facts})
         return models, asked.get("matches", {})
 
@@ -75,7 +75,7 @@ def test_the_largest_model_is_kept_and_the_rest_is_named(
     assert main(["poses", str(folder)]) == 0
     said = capsys.readouterr().out
     for fact in (
-        f"{folder / 'sparse' / '0'}: 3 of 5 photographs have poses, 7 points, 1 camera, reprojection error 0.50 pixels",
+        f"{folder / 'sparse' / '0'}: 3 of 5 photographs have poses, 70 points, 1 camera, reprojection error 0.50 pixels",
         "1 photographs (near/e.jpg, ...) have poses in separate models",
         "photograph what lies between near/e.jpg and near/d.jpg, or put another place into a folder of its own",
         "without a pose: near/c.webp (few matches: 21 points in common with a.jpg); photograph again",
@@ -140,6 +140,17 @@ def test_what_cannot_have_poses_is_refused(folder: Path, job: dict, tmp_path: Pa
     Image.fromarray(pixels(8, 8)).save(tmp_path / "few" / "a.png")
     assert_refused("found 1 photograph in .*few, expected at least 3", poses.find_poses, tmp_path / "few")
     assert_refused("found no folder", poses.find_poses, tmp_path / "none")
+    (tmp_path / "days" / "one").mkdir(parents=True)
+    assert_refused("found 0 photographs .* name the folder that holds them", poses.find_poses, tmp_path / "days")
+    Image.fromarray(pixels(8, 8)).save(tmp_path / "days" / "one" / "a.png")
+    assert_refused(r"in folders of it only \(one\), expected them in .*images", poses.find_poses, tmp_path / "days")
+
+
+def test_a_model_with_few_points_is_none(folder: Path, job: dict) -> None:
+    """COLMAP poses three photographs by a single point, and the reprojection error is 0."""
+    job["points"] = poses.FEWEST_POINTS - 1
+    assert_refused("found 5 photographs without enough overlap", poses.find_poses, folder)
+    assert not (folder / "sparse").exists() and not (folder / poses.WORK).exists()
 
 
 def test_damaged_photographs_are_left_out_and_named(folder: Path, job: dict) -> None:
