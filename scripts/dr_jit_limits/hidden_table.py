@@ -1,4 +1,4 @@
-"""A call of a stock ``tabphase`` cannot be recorded: Mitsuba hides its table from Dr.Jit. A pointer to it has the same effect."""
+"""A call of a stock ``tabphase``, directly or by a pointer, cannot be recorded: Mitsuba hides its table from Dr.Jit."""
 
 import drjit as dr
 import mitsuba as mi
