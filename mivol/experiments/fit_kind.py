@@ -14,7 +14,7 @@ from mivol.experiments.run_folder import BestFiles, BestIterate, RunFolder
 from mivol.optim.loop import Course, Fit, Measure
 from mivol.optim.optimizer import Optimizer
 from mivol.optim.problem import Problem
-from mivol.report.record import RunRecord, Table
+from mivol.report.record import Image, RunRecord, Table
 from mivol.scene.explain import Explanation
 from mivol.validate.reference import Complete
 
@@ -121,6 +121,7 @@ class FitKind(ABC):
         stages: names of the timed stages.
         first_row: number of the first row in ``metrics.jsonl``: 1 if a row counts the steps taken, 0 if a row has the index of
             the step.
+        has_live_page: whether the report page is also written while the fit runs, without a cluster.
         context: the experiment to run.
         settings: settings of the experiment; ``load`` puts values in place of "auto".
         record: content of ``run.json``; the recorded settings stay as given.
@@ -133,6 +134,7 @@ class FitKind(ABC):
 
     stages: ClassVar[Stages]
     first_row: ClassVar[int] = 1
+    has_live_page: ClassVar[bool] = False
     problem: Problem
     measure: Measure | None = None
 
@@ -194,6 +196,10 @@ class FitKind(ABC):
     @abstractmethod
     def digests(self) -> dict[str, str]:
         """Return hashes of the data. A resumed run must have the same hashes."""
+
+    def live_images(self, run: RunFolder) -> list[Image]:
+        """Pictures of the page while the fit runs, beside those on record; their files are written."""
+        return []
 
     def begin(self, run: RunFolder) -> None:  # noqa: B027
         """Write what a viewer shows before the first model, once the folder belongs to the run."""

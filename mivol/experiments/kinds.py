@@ -94,12 +94,12 @@ MOST_SHARE_OF_PAGES = 0.02
 
 
 class LivePage:
-    """The page of a fit on a cluster while it runs: curves so far, progress, and a table of the workers. Without a cluster,
-    the page is written at the end only."""
+    """The page of a fit while it runs: curves so far, progress, pictures of the kind, and a table of the workers. Without a
+    cluster, only kinds with ``has_live_page`` have one; other pages are written at the end."""
 
     def __init__(self, kind: FitKind, run: RunFolder, workers: Distribution | None) -> None:
         self.kind, self.run, self.workers = kind, run, workers
-        self.has_page, self.due = False, time.monotonic()
+        self.has_page, self.due = False, time.monotonic() + (SECONDS_BETWEEN_PAGES if workers is None else 0)
 
     def __enter__(self) -> Self:
         return self
@@ -113,15 +113,17 @@ class LivePage:
     def show(self, fit: Fit, iterations: int) -> None:
         """Write record and page, if they are due."""
         start = time.monotonic()
-        if self.workers is None or start < self.due:
+        workers = self.workers
+        if (workers is None and not self.kind.has_live_page) or start < self.due:
             return
         record = self.run.record
-        said = f"{fit.next_iteration} of {iterations} iterations, {self.workers.describe()}"
+        said = f"{fit.next_iteration} of {iterations} iterations" + (f", {workers.describe()}" if workers else "")
         shown = msgspec.structs.replace(
             record,
             timings=record.timings | {self.kind.stages.fit: fit.seconds},
             notes=[said, *record.notes],
-            tables=[*record.tables, *self.workers.tables()],
+            tables=[*record.tables, *(workers.tables() if workers else ())],
+            images=[*record.images, *self.kind.live_images(self.run)],
         )
         write_record(shown, self.run.path)
         write_page(self.run.path)

@@ -52,7 +52,7 @@ from mivol.optim.projections.inversion import ALL_SOLVERS, DIRECT, DriftFit, Lin
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SolverState, expected_residual_norm
 from mivol.report.cameras import draw_scanner
 from mivol.report.figures import plot_moves, plot_ring_removal, save_figure
-from mivol.report.pixel_scale import is_preview_due, write_preview
+from mivol.report.pixel_scale import PREVIEW, is_preview_due, write_preview
 from mivol.report.record import LINES, SINOGRAM, Image, PlanLine, Volume
 from mivol.scene.explain import Explanation
 from mivol.tomography.filtered import check_directions, feldkamp, filtered_backprojection
@@ -77,6 +77,7 @@ class ScanFit(FitKind):
     """
 
     stages = Stages("projections", "solve", "images and volumes")
+    has_live_page = True
     settings: ScanExperiment
     problem: ProjectionProblem
 
@@ -166,6 +167,10 @@ class ScanFit(FitKind):
         if is_preview_due(fit.next_iteration, self.settings.solve.iterations):
             write_preview(run.path, evaluation.values["volume"], tuple(self.grid.extent))
             run.write_newest(evaluation.values["volume"], self.grid.to_world)
+
+    def live_images(self, run: RunFolder) -> list[Image]:
+        preview = Image(path=PREVIEW, role="picture", caption="middle slices so far")
+        return draw_steps(run, self.data, row_caption(self.data)) + ([preview] if (run.path / PREVIEW).exists() else [])
 
     def finish(self, fit: Fit, run: RunFolder) -> None:
         last, state, problem, record = self.settings.solve.iterations, fit.run.state, self.problem.linear_problem, self.record
@@ -372,14 +377,14 @@ def write_outputs(
     record.images += film_of_volume(run, volume[..., None], tuple(float(edge) for edge in grid.extent), "z", "sigma_t")
     middle = data.y.shape[1] // 2
     noise = line_noise(data)
-    caption = f"row {middle + 1} of {data.y.shape[1]}"
+    caption = row_caption(data)
     record.images += write_pair(run.path, SINOGRAM, Pair(data.y[:, middle], predicted[:, middle], noise[:, middle]), caption)
     if data.y.shape[1] > 1:
         for view in held_out[:4]:
             pair = Pair(*(part[view, ::-1] for part in (data.y, predicted, noise)))
             record.images += write_pair(run.path, f"view {view}", pair, held_out=True)
     record.images += draw_scanner(run.path, data.geometry, grid, held_out)
-    draw_steps(run, data, caption)
+    record.images += draw_steps(run, data, caption)
     run.write_curves()
     if data.truth is not None:
         record.results["nrmse"] = nrmse(volume, data.truth)
@@ -395,15 +400,22 @@ STEPS = {
 """Captions of the pictures of steps whose name does not say enough."""
 
 
-def draw_steps(run: RunFolder, data: Projections, caption: str) -> None:
-    """Draw what each step of the preparation changed in the middle row, and record the pictures."""
+def row_caption(data: Projections) -> str:
+    """Name of the middle row of the detector."""
+    return f"row {data.y.shape[1] // 2 + 1} of {data.y.shape[1]}"
+
+
+def draw_steps(run: RunFolder, data: Projections, caption: str) -> list[Image]:
+    """Draw what each step of the preparation changed in the middle row; return the pictures."""
     steps, row = list(data.pictures), data.y[:, data.y.shape[1] // 2]
     if data.removed_rings is not None:
         steps.append(("rings", row + data.removed_rings, row))
+    images = []
     for name, before, after in steps:
         save_figure(plot_ring_removal(before, after), run.path / f"{name}.png")
         said = f"{STEPS.get(name, name)} in {caption}, each line one view"
-        run.record.images.append(Image(path=f"{name}.png", role="picture", caption=said))
+        images.append(Image(path=f"{name}.png", role="picture", caption=said))
+    return images
 
 
 FINISHED = "volumes/reconstruction.npz"

@@ -382,7 +382,7 @@ def run_slabs(context: RunContext) -> Path:
         run.begin(0)
         run.make("volumes")
         if plan.source.sample is not None:
-            draw_steps(run, plan.source.sample, "a row in the middle")
+            record.images += draw_steps(run, plan.source.sample, "a row in the middle")
         with run.stage("preview"):
             caption = _write_preview(plan, preview_rows(plan), run.path)
             record.images.append(Image(path=PREVIEW, role="picture", caption=caption))

@@ -18,7 +18,8 @@ from mivol.experiments.fit_kind import NullProgress, RunContext
 from mivol.experiments.kinds import LivePage, run_experiment
 from mivol.experiments.run_folder import EARLIER, KEPT, BestFiles, BestIterate, RunFolder
 from mivol.files.atomic import whole_file
-from mivol.report.record import RunRecord, Table, read_metrics, read_record
+from mivol.report.pixel_scale import write_preview
+from mivol.report.record import Image, RunRecord, Table, read_metrics, read_record
 
 
 def folder(path: Path, title: str = "a run", is_resumed: bool = False) -> RunFolder:
@@ -49,11 +50,36 @@ def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
         assert read_record(first.path).title == "another run"
 
 
+def page_of_a_kind(has_live_page: bool) -> SimpleNamespace:
+    def draw(run: RunFolder) -> list[Image]:
+        write_preview(run.path, np.ones((2, 3, 4)), (4.0, 3.0, 2.0))
+        return [Image(path="preview.png", role="picture", caption="slices so far")]
+
+    return SimpleNamespace(stages=SimpleNamespace(fit="fit"), has_live_page=has_live_page, live_images=draw)
+
+
+def test_the_page_of_a_scan_is_live(tmp_path: Path) -> None:
+    """Without a cluster too, after some seconds, with pictures and the errors so far."""
+    fit = SimpleNamespace(next_iteration=2, seconds=2.0)
+    run = folder(tmp_path)
+    with LivePage(page_of_a_kind(has_live_page=True), run, None) as page, run.at_work():
+        run.begin(0)
+        for iteration in (1, 2):
+            run.append(iteration, 1.0, loss=0.5, residual=0.25)
+        page.show(fit, 40)
+        assert not (run.path / "report.html").exists()  # too early
+        page.due = 0.0
+        page.show(fit, 40)
+        said = (run.path / "report.html").read_text()
+        assert all(words in said for words in ("2 of 40 iterations<", "slices so far", "Residual", REFRESH))
+    assert run.record.images == []
+
+
 def test_the_page_of_a_fit_on_a_cluster_is_live(tmp_path: Path) -> None:
     """While the fit runs, the page has the workers and is read again; a stopped run has the last page. Alone: no page."""
     rows = Table(title="Workers", head=("host",), rows=(("node7",),))
     workers = SimpleNamespace(describe=lambda: "2 workers, a step takes 9 ms", tables=lambda: [rows])
-    kind, fit = SimpleNamespace(stages=SimpleNamespace(fit="fit")), SimpleNamespace(next_iteration=3, seconds=2.0)
+    kind, fit = page_of_a_kind(has_live_page=False), SimpleNamespace(next_iteration=3, seconds=2.0)
     for distribution in (None, workers):
         run = folder(tmp_path)
         with pytest.raises(KeyError), LivePage(kind, run, distribution) as page, run.at_work():
