@@ -418,5 +418,5 @@ def decode(dcmread: Any, file: Path) -> np.ndarray:
                 file,
                 f"pixels compressed by {syntax.name}",
                 "a compression that pydicom decodes here",
-                "install its decoder (pylibjpeg with pylibjpeg-libjpeg), or write the series uncompressed",
+                'pip install "mivol[lab]" has its decoder; or write the series uncompressed',
             ) from error

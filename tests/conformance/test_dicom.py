@@ -11,6 +11,8 @@ import pydicom
 import pytest
 from dicom_series import AXES, expected_place, header, write_frames, write_series
 from pydicom.data import get_testdata_file
+from pydicom.pixels import get_decoder
+from pydicom.uid import JPEGLSLossless
 from refusals import assert_refused
 
 from mivol.cli import main
@@ -209,12 +211,23 @@ def test_a_series_that_the_memory_does_not_hold_is_refused(tmp_path: Path, monke
     assert_refused("at most the free memory", read_volume, tmp_path / "s")
 
 
-@pytest.mark.parametrize(
-    ("name", "found"), [("MR_small_jpeg_ls_lossless.dcm", "JPEG-LS.*pylibjpeg"), ("rtplan.dcm", "without pix")]
-)
-def test_real_files_that_are_refused(tmp_path: Path, name: str, found: str) -> None:
-    shutil.copy(get_testdata_file(name), tmp_path / name)
-    assert_refused(found, read_volume, tmp_path / name)
+def test_a_file_without_pixels_is_refused(tmp_path: Path) -> None:
+    shutil.copy(get_testdata_file("rtplan.dcm"), tmp_path / "rtplan.dcm")
+    assert_refused("without pix", read_volume, tmp_path / "rtplan.dcm")
+
+
+@pytest.mark.parametrize("has_decoder", [True, False])
+def test_jpeg_ls(has_decoder: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A real slice, compressed and not. The decoder is that of the extra ``lab``."""
+    plain, packed = tmp_path / "plain", tmp_path / "packed"
+    for folder, name in ((plain, "MR_small.dcm"), (packed, "MR_small_jpeg_ls_lossless.dcm")):
+        folder.mkdir()
+        shutil.copy(get_testdata_file(name), folder / name)
+    if has_decoder:
+        np.testing.assert_array_equal(read_volume(packed).values, read_volume(plain).values)
+        return
+    monkeypatch.delitem(get_decoder(JPEGLSLossless)._available, "gdcm")
+    assert_refused(r"JPEG-LS.*mivol\[lab\]", read_volume, packed)
 
 
 def test_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
