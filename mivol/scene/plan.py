@@ -435,7 +435,8 @@ def build_estimators(
     media = build_media(scene, needs, plan, survey, readings, for_images, tracer)
     if settings.deterministic:
         media = media.by_quadrature()
-    direct = DirectLighting(media, balls)
+    # Candidates would lengthen gradients by a tenth.
+    direct = DirectLighting(media, balls, resamples=for_images)
     choice = SegmentInputs(direct, plan.scattering_points)
     if plan.segment in ("single_scattering", "scattering_quadrature"):
         with dr.suspend_grad():

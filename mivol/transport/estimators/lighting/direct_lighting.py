@@ -169,6 +169,7 @@ class DirectLighting:
     Args:
         media: media and surfaces of the scene.
         balls: numbers of :func:`mivol.transport.estimators.lighting.emitters.read_balls`; by default read from the scene.
+        resamples: whether samples of lamps with hidden sides are drawn from candidates.
 
     Attributes:
         shadow_table: table of the shadows of vertices in media, in images; None for shadow rays.
@@ -176,8 +177,8 @@ class DirectLighting:
 
     shadow_table: TransmittanceGrid | None
 
-    def __init__(self, media: SceneMedia, balls: mi.Float | None = None) -> None:
-        self.media, self.shadow_table, self._balls = media, None, balls
+    def __init__(self, media: SceneMedia, balls: mi.Float | None = None, resamples: bool = True) -> None:
+        self.media, self.shadow_table, self._balls, self._resamples = media, None, balls, resamples
 
     @cached_property
     def emitters(self) -> SceneEmitters:
@@ -203,7 +204,8 @@ class DirectLighting:
             return self._find_emitters(distance)
 
     def _find_emitters(self, distance: str) -> SceneEmitters:
-        return SceneEmitters(self.media.scene, self.media.start is not None, distance, self._balls, self.media.lit_box)
+        made = self._balls, self.media.lit_box, self._resamples
+        return SceneEmitters(self.media.scene, self.media.start is not None, distance, *made)
 
     def sample_emitter(
         self, it: mi.Interaction3f, u: mi.Point2f, active: mi.Bool, emitters: SceneEmitters | None = None

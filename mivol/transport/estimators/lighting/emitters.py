@@ -63,6 +63,7 @@ class SceneEmitters:
         distance: ``near`` for the emitters with a position alone, ``far`` for the emitters at infinity alone, ``any`` for all.
         balls: numbers of :func:`read_balls`; by default read from the scene.
         lit_box: corners of :func:`find_lit_box`; by default found in the scene.
+        resamples: whether samples of lamps with hidden sides are drawn from candidates.
 
     Attributes:
         sampled: emitters that next-event estimation chooses from: all except a constant environment.
@@ -79,6 +80,7 @@ class SceneEmitters:
         distance: str = "any",
         balls: mi.Float | None = None,
         lit_box: np.ndarray | None = None,
+        resamples: bool = True,
     ) -> None:
         placed = list(zip(scene.emitters(), _find_balls(scene, balls), strict=True))
         if distance != "any":
@@ -92,7 +94,7 @@ class SceneEmitters:
         self._balls = [ball for e, ball in placed if e.class_name() != UNIFORM_EMITTER]
         self.is_near = any(ball is not None for ball in self._balls)
         self._from_camera = from_camera
-        self._hiding = [e for e in self.sampled if _hides_sides(e)]
+        self._hiding = [e for e in self.sampled if resamples and _hides_sides(e)]
         # Dr.Jit records a call for every emitter of the scene, chosen or not.
         self.are_evaluated = all(e.class_name() != PARALLEL_AREA for e in scene.emitters())
         if self.sampled:
