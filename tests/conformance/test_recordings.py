@@ -450,16 +450,23 @@ def among_shapes(**more: dict) -> mi.Scene:
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.5]).scale(3)}
     above = mi.ScalarTransform4f().look_at([0.5, -1, 3], [0, 0, 0], [0, 1, 0]).scale(0.5)
     lamp = {"type": "rectangle", "to_world": above, "emitter": {"type": "area", "radiance": 9.0}}
-    ball = {"type": "sphere", "center": [-1.5, 0, 0], "radius": 0.3}
-    block = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([1.6, 0, 0]).scale(0.3)}
+    ball = {"type": "sphere", "center": [1.0, -1.5, 0.9], "radius": 0.2}
+    block = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0.5, -1.6, 0.3]).scale(0.3)}
     return smoke_under(**({"floor": floor, "lamp": lamp, "ball": ball, "block": block} | more))
 
 
-def fog_in(shape: dict, **more: dict) -> mi.Scene:
-    """A homogeneous medium over a floor, under a sky and a lamp."""
+def fog_in(shape: dict, other: dict | None = None, **more: dict) -> mi.Scene:
+    """A homogeneous medium over a floor, under a lamp."""
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.5]).scale(3)}
     fog = shape | {"bsdf": {"type": "null"}, "interior": medium("homogeneous", 1.5, 0.8)} | more
-    return close_up({"smoke": fog, "floor": floor, "lamp": point((0.2, 0.1, 5.0))[0]}, res=6)
+    others = {} if other is None else {"other": other}
+    return close_up({"smoke": fog, "floor": floor, "lamp": point((0.2, 0.1, 5.0))[0], **others}, res=6)
+
+
+def smoke_in_the_sun() -> mi.Scene:
+    """Images have a table of shadows."""
+    grid = medium("mivol_medium", grid_volume("mivol_voxels", rough_grid(4, 3.0).astype(np.float32), PLACE), 0.8)
+    return close_up({"smoke": box_of(grid, PLACE), "sun": sun([0.3, 0.2, -1.0])[0]}, res=96)
 
 
 MOVED_SHAPES: dict[str, tuple[Callable[[], mi.Scene], str, str]] = {
@@ -475,56 +482,80 @@ MOVED_SHAPES: dict[str, tuple[Callable[[], mi.Scene], str, str]] = {
         "smoke.vertex_positions",
         INSIDE + "sigma_t.value.value",
     ),
+    "box with a table of shadows": (smoke_in_the_sun, "smoke.vertex_positions", INSIDE + "albedo.value.value"),
     "box of a grid": (smoke_under, "smoke.vertex_positions", INSIDE + "sigma_t.data"),
 }
 """A scene, a parameter that places a shape, and a parameter to differentiate."""
 
 
-@pytest.mark.parametrize("name", cases(MOVED_SHAPES, slow=("floor", "lamp", "block in the sun", "box of glass", "ball of fog")))
+@pytest.mark.parametrize("name", cases(MOVED_SHAPES, slow=set(MOVED_SHAPES) - {"ball", "block", "box of fog"}))
 def test_the_place_of_a_shape_is_followed(name: str) -> None:
     """Images to the last bit as by an integrator that has seen no other place; gradients to the rounding of their sums."""
     make, key, differentiated = MOVED_SHAPES[name]
     pair, sums = Pair(make(), 4), set()
     start = dr.detach(pair.params[key])
-    for x in (0.0, 0.05, 0.1, 0.12, 0.03, 0.06):
-        is_mesh = key.endswith("vertex_positions")
-        pair.params[key] = start + x if is_mesh else mi.AffineTransform4f().translate([x, x, x]) @ start
-        pair.params.update()
+    for x in (0.0, 0.05, 0.1, 0.12, 0.03):
+        place_shape(pair, key, start, x)
         pair.assert_same(0)
         found, truth = pair.gradients(differentiated, 1)
-        assert np.abs(found - truth).max() <= (200 if truth.size > 3 else 432) * 2**-24 * np.abs(truth).max()
+        assert np.abs(found - truth).max() <= (200 if truth.size > 3 else 432) * 2**-24 * np.abs(truth).max() > 0
         image = np.array(mi.render(pair.scene, integrator=mi.load_dict(mivol(max_depth=4)), seed=0, spp=2))
-        assert np.array_equal(pair.images(0)[0], image) and np.abs(truth).max() > 0
-        sums.add((image.sum(), np.abs(truth).sum()))
-        if x == 0.12:
-            count = pair.recordings.count
-    assert len(sums) == 6 and pair.recordings.count == count and not any(pair.recordings.failures.values())
+        assert np.array_equal(pair.images(0)[0], image)
+        sums.add(image.sum())
+    assert len(sums) == 5 and not any(pair.recordings.failures.values())
+
+
+@pytest.mark.parametrize("name", cases(MOVED_SHAPES, slow=set(MOVED_SHAPES) - {"block", "ball of fog"}))
+def test_shapes_move_without_another_recording(name: str) -> None:
+    """After some places, in which numbers become arrays and arrays of one memory are joined."""
+    make, key, differentiated = MOVED_SHAPES[name]
+    pair, counts = Pair(make(), 3), []
+    start = dr.detach(pair.params[key])
+    for x in (0.0, 0.05, 0.1, 0.12, 0.03, 0.06, 0.02, 0.04, 0.01, 0.08, 0.07, 0.09):
+        place_shape(pair, key, start, x)
+        pair.gradient(pair.recorded, differentiated, 1)
+        counts.append(pair.recordings.count)
+    assert counts[7] == counts[11] > 0 and not any(pair.recordings.failures.values())
+
+
+def place_shape(pair: Pair, key: str, start: object, x: float) -> None:
+    """Move a shape from its first place."""
+    is_mesh = key.endswith("vertex_positions")
+    pair.params[key] = start + x if is_mesh else mi.AffineTransform4f().translate([x, x, x]) @ start
+    pair.params.update()
 
 
 def chequered_floor() -> mi.Scene:
-    """Smoke over a floor with colours that turn with it; a quarter turn keeps its bounding box."""
+    """Smoke over a floor with colours that turn with it; half a turn keeps its bounding box."""
     colours = np.random.default_rng(2).uniform(0.1, 0.9, (4, 4, 3)).astype(np.float32)
     texture = {"type": "bitmap", "data": mi.TensorXf(colours), "raw": True, "filter_type": "nearest"}
     place = mi.ScalarTransform4f().translate([0, 0, -1.5]).scale(3)
     return among_shapes(floor={"type": "rectangle", "to_world": place, "bsdf": {"type": "diffuse", "reflectance": texture}})
 
 
+def glowing_box() -> mi.Scene:
+    """A box of constants, whose light paths draw, over a floor."""
+    glow = medium("mivol_medium", 1.0, 0.5) | {"emission": {"type": "constvolume", "value": 40.0}}
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.5]).scale(3)}
+    return close_up({"smoke": box_of(glow, np.diag([0.5, 0.5, 0.5, 1.0])), "floor": floor}, res=6)
+
+
 PLACED_ANEW: dict[str, tuple[Callable[[], mi.Scene], str, str, list]] = {
-    "quarter turns": (chequered_floor, "floor.to_world", "rotate", [([0, 0, 1], angle) for angle in (0, 90, 180)]),
+    "half a turn": (chequered_floor, "floor.to_world", "scale", [(1,), ([-1, -1, 1],)]),
     "mirrored": (among_shapes, "ball.to_world", "scale", [(1,), ([-1, 1, 1],), (1,)]),
     "lamp in smoke": (among_shapes, "lamp.to_world", "translate", [([-0.5, 1, z],) for z in (0, -2.9, -0.1)]),
-    "fire": (fire, "smoke.vertex_positions", "translate", [([x, 0, 0],) for x in (0, 0.1, 0.2)]),
+    "glow": (glowing_box, "smoke.vertex_positions", "translate", [([x, 0, 0],) for x in (0, 0.1, 0.2)]),
     "balls apart": (
-        lambda: among_shapes(other={"type": "sphere", "center": [-1.5, 0, 0], "radius": 0.3}),
+        lambda: among_shapes(other={"type": "sphere", "center": [1.0, -1.5, 0.9], "radius": 0.2}),
         "other.to_world",
         "translate",
         [([x, 0, x],) for x in (0, 0.3, 0.5, 0)],
     ),
     "flat table of shadows": (
-        lambda: fog_in({"type": "cube"}, interior=medium("homogeneous", 20.0, 0.9)),
+        smoke_in_the_sun,
         "smoke.vertex_positions",
         "scale",
-        [([1, 1, z],) for z in (1, 0.9, 0.5, 0.3)],
+        [([1, 1, z],) for z in (1, 0.9, 0.5, 0.49)],
     ),
 }
 """A scene, a parameter that places a shape, and maps of its first place. They change more than the place."""
@@ -547,8 +578,7 @@ def test_a_place_that_changes_more_is_met_as_if_it_were_the_first(name: str) -> 
         for _ in range(2):
             assert np.array_equal(pair.images(1)[0], truth)
         sums.add(truth.sum())
-    # A mirrored ball keeps its flipped normals.
-    assert len(sums) >= len(set(map(str, given)))
+    assert len(sums) > 1
 
 
 def test_a_gradient_at_an_earlier_place_follows_an_image_elsewhere() -> None:
@@ -573,13 +603,16 @@ def test_a_gradient_at_an_earlier_place_follows_an_image_elsewhere() -> None:
 
 
 def test_a_boundary_that_moves_into_another_is_refused() -> None:
-    pair = Pair(smoke_under(other=ball_of(medium("homogeneous", 1.0, 0.5), (3.0, 0.0, 0.0), 0.5), sky=sky(0.7)), 3)
+    """Both are traced, so that nothing but their places changes."""
+    ball, glass = {"type": "sphere", "radius": 0.5}, {"type": "thindielectric"}
+    fog = medium("homogeneous", 1.0, 0.5)
+    pair = Pair(fog_in(ball, bsdf=glass, other=ball | {"center": [3, 0, 0], "bsdf": glass, "interior": fog}), 3)
     pair.assert_same(1)
     start = dr.detach(pair.params["other.to_world"])
-    for x, is_apart in ((-1.2, True), (-1.7, False)):
+    for x, is_apart in ((-1.9, True), (-2.5, False)):
         pair.params["other.to_world"] = mi.AffineTransform4f().translate([x, 0, 0]) @ start
         pair.params.update()
-        with contextlib.nullcontext() if is_apart else refused("other and smoke overlap"):
+        with contextlib.nullcontext() if is_apart else refused("smoke and other overlap"):
             pair.assert_same(1)
 
 
