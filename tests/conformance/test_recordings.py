@@ -540,9 +540,14 @@ def glowing_box() -> mi.Scene:
     return close_up({"smoke": box_of(glow, np.diag([0.5, 0.5, 0.5, 1.0])), "floor": floor}, res=6)
 
 
+def inside_a_ball() -> mi.Scene:
+    """A ball around everything is black inside, unless its normals are flipped."""
+    return smoke_under(lamp=point((0.2, 0.1, 2.0))[0], ball={"type": "sphere", "radius": 6})
+
+
 PLACED_ANEW: dict[str, tuple[Callable[[], mi.Scene], str, str, list]] = {
     "half a turn": (chequered_floor, "floor.to_world", "scale", [(1,), ([-1, -1, 1],)]),
-    "mirrored": (among_shapes, "ball.to_world", "scale", [(1,), ([-1, 1, 1],), (1,)]),
+    "mirrored": (inside_a_ball, "ball.to_world", "scale", [(1,), (0.9,), (0.95,), (0.85,), ([-1, 1, 1],)]),
     "lamp in smoke": (among_shapes, "lamp.to_world", "translate", [([-0.5, 1, z],) for z in (0, -2.9, -0.1)]),
     "glow": (glowing_box, "smoke.vertex_positions", "translate", [([x, 0, 0],) for x in (0, 0.1, 0.2)]),
     "balls apart": (
