@@ -64,7 +64,7 @@ def remove_rings(y: np.ndarray, weights: np.ndarray, method: str, width: int) ->
     is reduced to its share on which the arcs agree, and to 0 in a row whose arcs agree only by chance (empirical Bayes).
 
     ``"sort"`` replaces the value of rank k by the median of :math:`s_{k,\cdot}` over w columns; the outermost column continues
-    beyond the edges.
+    beyond the edges. A row in which ``"gain"`` finds nothing keeps its values.
 
     Args:
         y: line integrals (views, rows, cols).
@@ -90,7 +90,7 @@ def remove_rings(y: np.ndarray, weights: np.ndarray, method: str, width: int) ->
         raise MivolError(f"found a ring width of {width}, expected {expected}: set data.ring_width.")
     seen = interpolate_gaps(y, weights)
     # Row by row: ranks and sorted values take three times the memory of what is sorted.
-    correct = {"gain": _subtract_gains, "sort": _smooth_ranks}[method]
+    correct = {"gain": _subtract_gains, "sort": _smooth_striped}[method]
     corrected = np.stack([correct(seen[:, row], width) for row in range(y.shape[1])], axis=1)
     return np.where(weights > 0, corrected, y)
 
@@ -216,6 +216,12 @@ class PixelGains:
         left = seen - self.fit(seen).astype(residual.dtype)
         left *= self._weights
         return left.reshape(residual.shape)
+
+
+def _smooth_striped(y: np.ndarray, width: int) -> np.ndarray:
+    """``_smooth_ranks`` of a row (views, cols) in which gains are found; another row as it is."""
+    is_striped = not np.array_equal(_subtract_gains(y, min(RING_WIDTHS["gain"], y.shape[1])), y)
+    return _smooth_ranks(y, width) if is_striped else y
 
 
 def _smooth_ranks(y: np.ndarray, width: int) -> np.ndarray:

@@ -111,6 +111,8 @@ def test_offsets_that_change_between_arcs_are_no_gains(which: str) -> None:
         assert removed[0].argmax() == 30 and removed[0, 30] > 0.07
     else:
         np.testing.assert_array_equal(found, y)
+    # The published method has no such share, so it changes only rows with gains.
+    assert np.array_equal(remove_rings(y, np.ones(y.shape), "sort", 7), y) == (which == "none")
 
 
 def test_offsets_of_a_residual_are_its_mean_without_slow_changes() -> None:
