@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from mivol import config
 from mivol.errors import MivolError
@@ -141,4 +142,27 @@ def refine_geometry(
     judged = f"the residual of {len(found.after)} held-out views falls to {ratio:.2f}"
     used = judged if found.is_needed else f"{judged}, no more than by chance: the geometry stays as it was"
     note = f"fitted geometry (scan.refine): {'; '.join(lines)}; {used}"
-    return replace(data, geometry=found.beam, notes=(*data.notes, note)), found
+    shown = show_moves(data.y, _moves_between(data.geometry, found.beam))
+    return replace(data, geometry=found.beam, notes=(*data.notes, note), pictures=(*data.pictures, shown)), found
+
+
+def _moves_between(given: ParallelBeam | ConeBeam, fitted: ParallelBeam | ConeBeam) -> np.ndarray:
+    """The fitted moves of the detector less the given ones, (views, 3)."""
+    before, after = (np.zeros((len(b.angles), 3)) if b.moves is None else b.moves for b in (given, fitted))
+    return after - before
+
+
+def show_moves(y: np.ndarray, moves: np.ndarray) -> tuple[str, np.ndarray, np.ndarray]:
+    """A picture of fitted moves for the report: the middle row as measured, and at the same places of an unmoved detector.
+
+    Args:
+        y: line integrals (views, rows, cols).
+        moves: (views, 3) displacement of the detector along rows and columns [pixel], and turn [rad]; pixels count as square.
+    """
+    middle = (np.array(y.shape[1:]) - 1) / 2
+    row, column, turn = moves.T[..., None]
+    row, column = y.shape[1] // 2 - middle[0] - row, np.arange(y.shape[2]) - middle[1] - column
+    c, s = np.cos(turn), np.sin(turn)
+    places = c * row - s * column + middle[0], c * column + s * row + middle[1]
+    views = np.broadcast_to(np.arange(len(y))[:, None], places[0].shape)
+    return "motion", y[:, y.shape[1] // 2], map_coordinates(y, (views, *places), order=1, mode="nearest")

@@ -395,6 +395,7 @@ def write_outputs(
 
 STEPS = {
     "axis": "half a turn, then its mirror images about the middle of the detector (before) and about the found axis (after)",
+    "motion": "moved views as measured, and at the places of an unmoved detector,",
     "rings": "ring removal",
 }
 """Captions of the pictures of steps whose name does not say enough."""

@@ -153,3 +153,17 @@ def test_a_fitted_geometry_in_words(
     said = f"fitted geometry (scan.refine): {'; '.join(lines)}; the residual of 2 held-out views falls to 0.50{used}"
     assert found.notes == ("before", said)
     assert found.geometry is moved and alignment is fit
+    np.testing.assert_array_equal(found.pictures[-1][1], found.pictures[-1][2])  # the beam of this fit has no moves
+
+
+def test_fitted_moves_are_shown() -> None:
+    """Values that are linear in the place on an unmoved detector, as moved detectors see them; interpolation is exact."""
+    moves = np.array([[0.5, -1.25, 0.0], [0.0, 0.75, 0.2], [-1.0, 0.5, -0.1]])
+    row, column = np.mgrid[-4:5, -6:7]
+    c, s = np.cos(moves[:, 2])[:, None, None], np.sin(moves[:, 2])[:, None, None]
+    places = c * row + s * column + moves[:, 0, None, None], c * column - s * row + moves[:, 1, None, None]
+    name, before, after = corrections.show_moves(places[0] + 3 * places[1], moves)
+    assert name == "motion"
+    np.testing.assert_array_equal(before, places[0][:, 4] + 3 * places[1][:, 4])
+    inside = slice(3, -3)  # elsewhere the values of the last pixels are repeated
+    np.testing.assert_allclose(after[:, inside], np.broadcast_to(3.0 * np.arange(-6, 7), (3, 13))[:, inside], atol=1e-12)
