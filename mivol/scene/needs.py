@@ -100,6 +100,7 @@ def find_needs(
         is_colour_film=not mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special),
         are_samples_independent=sensor.sampler().class_name() == "IndependentSampler",
         emitter_distances=find_emitter_distances(scene, boundaries, media),
+        endless_media=_find_endless_media(scene, start, boundaries, views),
     )
     scatters = needs.surfaces or any(m.is_scattering for m in media)
     refused = any(m.bounded or m.has_own_walk for m in media)
@@ -126,6 +127,17 @@ def _sort_parameters(differentiated: Sequence[tuple[str, mi.Object]]) -> dict[st
         "parameters": tuple(key for key, _ in differentiated),
         "places": tuple(key for key, owner in differentiated if _is_placement(key, owner)),
     }
+
+
+def _find_endless_media(
+    scene: mi.Scene, start: list[mi.Medium], boundaries: Sequence[Boundary], views: Sequence[MediumView]
+) -> tuple[str, ...]:
+    """``Needs.endless_media``. Media in instances fill shapes of their own."""
+    edges = [shape for shape in scene.shapes() if shape.is_medium_transition()]
+    around = {m.ptr for m in (*start, *(edge.exterior_medium() for edge in edges)) if m is not None}
+    parts = zip(boundaries, views, strict=True)
+    free = [b.name for b, v in parts if b.around is None and b.medium.ptr in around and not all(p.lattice for p in v.parts)]
+    return tuple(free)
 
 
 def find_emitter_distances(scene: mi.Scene, boundaries: Sequence[Boundary], media: Sequence[MediumFacts]) -> tuple[float, ...]:
@@ -397,6 +409,8 @@ class Needs(ShapeFacts):
         are_samples_independent: whether the sensor has Mitsuba's independent sampler, whose numbers others may replace.
         emitter_distances: distance of each emitter to the nearest medium that scatters, over the longest edge of the box around
             the medium [1]; 0 for an emitter inside, or for a medium without a known end; infinite for an emitter at infinity.
+        endless_media: names of the media without a known end: they fill the space around the camera or around shapes, and no
+            grid bounds them.
         near_gain: measured gain of drawing the light of near emitters along segments [1] (:mod:`mivol.scene.previews`); None
             before a measurement.
         lamp_noise: measured variances, for one sample of a pixel, of the light of lamps seen directly and of all other light;
@@ -422,18 +436,13 @@ class Needs(ShapeFacts):
     is_colour_film: bool
     are_samples_independent: bool
     emitter_distances: tuple[float, ...]
+    endless_media: tuple[str, ...]
     near_gain: float | None = None
     lamp_noise: tuple[float, float] | None = None
     emission_noise: OwnRaysNoise | None = None
     branch_noise: BranchNoise | None = None
     mirror_noise: MirrorNoise | None = None
     media_light: MediaLight | None = None
-
-    @property
-    def endless_media(self) -> tuple[str, ...]:
-        """Names of the media without a known end: they fill the space around shapes, and no grid bounds them."""
-        parts = zip(self.boundaries, self.views, strict=True)
-        return tuple(b.name for b, view in parts if b.around is None and not all(p.lattice for p in view.parts))
 
     @property
     def nearness(self) -> float:
