@@ -100,7 +100,7 @@ def find_needs(
         is_colour_film=not mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special),
         are_samples_independent=sensor.sampler().class_name() == "IndependentSampler",
         emitter_distances=find_emitter_distances(scene, boundaries, media),
-        endless_media=_find_endless_media(scene, start, boundaries, views),
+        endless_media=_name_endless_media(scene, start, boundaries, views),
     )
     scatters = needs.surfaces or any(m.is_scattering for m in media)
     refused = any(m.bounded or m.has_own_walk for m in media)
@@ -129,7 +129,7 @@ def _sort_parameters(differentiated: Sequence[tuple[str, mi.Object]]) -> dict[st
     }
 
 
-def _find_endless_media(
+def _name_endless_media(
     scene: mi.Scene, start: list[mi.Medium], boundaries: Sequence[Boundary], views: Sequence[MediumView]
 ) -> tuple[str, ...]:
     """``Needs.endless_media``. Media in instances fill shapes of their own."""
@@ -189,21 +189,13 @@ def find_clipped_view(needs: Needs, sensor: mi.Sensor) -> str:
     )
 
 
-def warn_of_clipped_view(needs: Needs, sensor: mi.Sensor, survey: SceneSurvey) -> None:
-    """Warn once for each scene and sensor if no ray meets a medium."""
-    if ("clipped", sensor.ptr) in survey.warned or is_recording():
-        return
-    survey.warned.add(("clipped", sensor.ptr))
-    if said := find_clipped_view(needs, sensor):
-        warnings.warn(f"{said} (this is said once).", MivolWarning, stacklevel=2)
-
-
 def find_undefined_light(needs: Needs, scene: mi.Scene, sensor: mi.Sensor) -> str:
     """A sentence if extended light from infinity would have to cross a medium without an end; else empty.
 
     No sentence if surfaces stop all of 256 rays that leave the camera in directions spread over the sphere.
     """
-    far = [e for e in scene.emitters() if int(e.flags()) & int(mi.EmitterFlags.Infinite) and _is_extended(e)]
+    emitters = zip(scene.emitters(), needs.emitter_kinds, strict=True)
+    far = [e for e, kind in emitters if kind != "delta" and int(e.flags()) & int(mi.EmitterFlags.Infinite)]
     if not needs.endless_media or not far or _are_rays_stopped(scene, sensor):
         return ""
     return (
@@ -213,17 +205,13 @@ def find_undefined_light(needs: Needs, scene: mi.Scene, sensor: mi.Sensor) -> st
     )
 
 
-def warn_of_undefined_light(needs: Needs, scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey) -> None:
-    """Warn once for each scene and sensor if extended light from infinity would cross a medium without an end."""
-    if ("undefined", sensor.ptr) in survey.warned or is_recording():
+def warn_of_view(needs: Needs, scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey) -> None:
+    """Warn once for each scene and sensor if no ray meets a medium, or if the light behind a medium is not defined."""
+    if ("view", sensor.ptr) in survey.warned or is_recording():
         return
-    survey.warned.add(("undefined", sensor.ptr))
-    if said := find_undefined_light(needs, scene, sensor):
+    survey.warned.add(("view", sensor.ptr))
+    for said in filter(None, (find_clipped_view(needs, sensor), find_undefined_light(needs, scene, sensor))):
         warnings.warn(f"{said} (this is said once).", MivolWarning, stacklevel=2)
-
-
-def _is_extended(emitter: mi.Emitter) -> bool:
-    return not int(emitter.flags()) & int(mi.EmitterFlags.Delta)
 
 
 def _are_rays_stopped(scene: mi.Scene, sensor: mi.Sensor) -> bool:

@@ -141,8 +141,8 @@ def prepare_placements(needs: Needs, size: float, shadow_nodes: int) -> tuple[mi
     if is_recording():
         return None, PlacementLayout()
     groups = [np.array([size], np.float64), needs.lit_box]
-    nodes, box = place_nodes(needs.lit_box, shadow_nodes)
-    groups += [box.from_world, box.to_world[:3]] if shadow_nodes else []
+    nodes, table = place_nodes(needs.lit_box, shadow_nodes)
+    groups += [table.from_world, table.to_world[:3]] if shadow_nodes else []
     boxes, holes, grids = [b.box for b in needs.boundaries], [b.hole for b in needs.boundaries], []
     for box, hole, view in zip(boxes, holes, needs.views, strict=True):
         groups += [one.from_world for one in (box, hole) if one is not None]

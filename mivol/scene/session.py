@@ -28,9 +28,8 @@ from mivol.scene.needs import (
     find_needs,
     may_camera_be_inside,
     read_media,
-    warn_of_clipped_view,
     warn_of_misplaced_grids,
-    warn_of_undefined_light,
+    warn_of_view,
 )
 from mivol.scene.plan import make_plan, plan_key, read_parts, settings_for
 from mivol.scene.previews import measure_noise, warn_of_last_order
@@ -345,8 +344,7 @@ class Session:
             needs = find_needs(scene, sensor, survey, spp, self.settings.may_draw_emission, state.differentiated)
         settings = settings_for(self.settings, needs, for_images)
         warn_of_misplaced_grids(needs, survey)
-        warn_of_clipped_view(needs, sensor, survey)
-        warn_of_undefined_light(needs, scene, sensor, survey)
+        warn_of_view(needs, scene, sensor, survey)
         with dr.suspend_grad():
             needs = measure_noise(scene, sensor, needs, survey, settings, for_images)
         plan = make_plan(needs, settings, self.aovs)

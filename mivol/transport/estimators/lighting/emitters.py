@@ -187,7 +187,7 @@ class SceneEmitters:
             active: lanes to sample.
         """
         direct, weight = emitter.sample_direction(it, u, active)
-        density, scale = mi.Float(direct.pdf), mi.Float(1)
+        scale = mi.Float(1)
         if self._hiding and self.are_evaluated:
             first, light = u, dr.max(weight)
             hides, total = active & is_among(self._hiding, emitter), mi.Float(light)
@@ -201,7 +201,7 @@ class SceneEmitters:
                 direct, weight = dr.select(keep, other, direct), dr.select(keep, other_weight, weight)
                 u, light = dr.select(keep, v, u), dr.select(keep, other_light, light)
             scale = dr.select(hides, total / (CANDIDATES * dr.select(light > 0, light, 1)), 1)
-            density = mi.Float(direct.pdf)
+        density = mi.Float(direct.pdf)
         direct.pdf = dr.select(scale > 0, density * probability / dr.select(scale > 0, scale, 1), 0)
         weight = weight * scale / dr.select(probability > 0, probability, 1)
         return EmitterDraw(direct, weight, emitter, u, density * probability)
