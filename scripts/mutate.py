@@ -1,8 +1,8 @@
 """Are the tests able to fail?  Break one line at a time in a copy of the checkout, and see whether a test goes red.
 
 Each entry of tests/mutations/*.toml names a file, a text that occurs in it once, the text to put in its place, and a
-test. The test must pass on the untouched copy and fail on the broken one; a crash or a hang of the broken one counts as
-failing, an import that breaks does not.
+test. All chosen tests must pass on the untouched copy, and each must fail on its broken one; a crash or a hang of the
+broken one counts as failing, an import that breaks does not.
 
     scripts/mutate.py                        all of them
     scripts/mutate.py --sample 12 --seed 7   twelve, drawn by the seed
@@ -26,7 +26,6 @@ import os
 import random
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -37,7 +36,7 @@ from pathlib import Path
 
 from mutation.faults import Fault, draw_faults, read_package
 from mutation.guards import ALL, group_entries, read_faults, read_recording, record_suite, write_faults
-from mutation.survivors import Checkout, judge_all, report
+from mutation.survivors import GREEN, UNFINISHED, Checkout, change_source, judge_all, report, run_pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 LEFT_OUT = (".git", ".venv", "runs", "__pycache__", ".pytest_cache", ".ruff_cache", ".hypothesis", "dist", "build")
@@ -90,49 +89,28 @@ def broken(entry: Mutation, root: Path) -> str:
     return text.replace(entry.find, entry.replace)
 
 
-def run_test(copy: Path, test: str, limit: float) -> tuple[int | None, str]:
-    """Run one test in the copy; its exit code (None where it did not end in time) and its output."""
-    env = dict(os.environ, PYTHONPATH=str(copy), PYTHONDONTWRITEBYTECODE="1")
-    env.setdefault("MIVOL_DATA", str(ROOT.parent / "shared" / "data"))
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-m", "slow or not slow", test]
-    try:
-        done = subprocess.run(
-            command, cwd=copy, env=env, capture_output=True, text=True, errors="replace", timeout=limit, check=False
-        )
-    except subprocess.TimeoutExpired:
-        return None, ""
-    return done.returncode, done.stdout + done.stderr
-
-
-def verdict(code: int | None, output: str) -> tuple[bool, str]:
-    """Whether the broken copy was noticed, and in one word how."""
-    if code is None:
+def verdict(code: int, output: str) -> tuple[bool, str]:
+    """Whether the broken copy was noticed, and in a few words how, by what :func:`mutation.survivors.run_pytest` returns."""
+    if UNFINISHED.search(output):
         return True, "red (hangs)"
     if code < 0:
         return True, f"red (signal {-code})"
     if code == PYTEST_FAILED and " failed" in output:
         return True, "red"
-    return False, "STILL GREEN" if code == 0 else f"DID NOT RUN (pytest ended with {code})"
+    if code != GREEN:
+        return False, f"DID NOT RUN (pytest ended with {code})"
+    return (False, "STILL GREEN") if re.search(r"\b\d+ passed", output) else (True, "skipped here")
 
 
-def judge(copy: Path, entry: Mutation, seen: dict[str, str], limit: float) -> tuple[bool, str]:
+def judge(copy: Path, entry: Mutation, limit: float) -> tuple[bool, str]:
     """Break the copy, run the test, mend the copy."""
-    if entry.test not in seen:
-        code, output = run_test(copy, entry.test, limit)
-        passed = re.search(r"\b\d+ passed", output)
-        skipped = re.search(r"\b\d+ skipped", output)
-        seen[entry.test] = "green" if code == 0 and passed else "skipped" if code == 0 and skipped else f"red\n{output}"
-    if seen[entry.test] == "skipped":
-        return True, "skipped here"
-    if seen[entry.test] != "green":
-        return False, f"RED BEFORE THE MUTATION {seen[entry.test]}"
     file = copy / entry.file
     whole = file.read_text()
-    file.write_text(broken(entry, copy))
+    change_source(file, broken(entry, copy))
     try:
-        return verdict(*run_test(copy, entry.test, limit))
+        return verdict(*run_pytest(copy, [entry.test], limit))
     finally:
-        file.write_text(whole)
+        change_source(file, whole)
 
 
 def choose(entries: list[Mutation], only: str, sample: int | None, seed: int) -> list[Mutation]:
@@ -154,12 +132,19 @@ def copies(count: int) -> Iterator[list[Path]]:
 
 
 def judge_entries(chosen: list[Mutation], limit: float) -> int:
-    """Say what becomes of each entry; the number of those that their test did not notice."""
-    missed, seen = 0, {}
+    """Say what becomes of each entry; the number of those that their test did not notice.
+
+    Raises:
+        RuntimeError: a test is red without a mutation.
+    """
+    missed = 0
     with copies(1) as (copy,):
+        code, output = run_pytest(copy, list(dict.fromkeys(entry.test for entry in chosen)), limit)
+        if code != GREEN:
+            raise RuntimeError(f"pytest ends with {code} before any mutation:\n{output[-2000:]}")
         for entry in chosen:
             start = time.perf_counter()
-            noticed, how = judge(copy, entry, seen, limit)
+            noticed, how = judge(copy, entry, limit)
             missed += not noticed
             print(f"{how:<14}{time.perf_counter() - start:6.1f} s  {entry}  [{entry.test}]", flush=True)
     print(f"{len(chosen) - missed} of {len(chosen)} mutations noticed")
@@ -183,7 +168,6 @@ def judge_random(args: argparse.Namespace) -> None:
     Raises:
         ValueError: as :func:`draw`; or no fault is left to judge.
     """
-    os.environ.setdefault("MIVOL_DATA", str(ROOT.parent / "shared" / "data"))
     # Each process of tests takes its share of the cores, as tests/conftest.py does for those of pytest-xdist.
     os.environ["PYTEST_XDIST_WORKER_COUNT"] = str(args.jobs)
     with copies(args.jobs + 1) as (untouched, *broken):
@@ -216,6 +200,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=ALL, metavar="S", help="of --random: recorded time of a fault's tests")
     parser.add_argument("--limit", type=float, default=300, metavar="SECONDS", help="time that one test may take")
     args = parser.parse_args(argv)
+    os.environ.setdefault("MIVOL_DATA", str(ROOT.parent / "shared" / "data"))
     if args.random is not None or args.faults is not None:
         if args.jobs < 1 or args.first < 1:
             parser.error("--jobs and --from take a number of 1 or more")

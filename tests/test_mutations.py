@@ -73,11 +73,12 @@ def test_a_text_that_occurs_twice_is_refused(tmp_path: Path) -> None:
 
 
 def test_verdicts() -> None:
-    """A test that passes, or that never ran, has noticed nothing."""
+    """A test that passes, or that never ran, has noticed nothing; one that is skipped here may notice elsewhere."""
     assert mutate.verdict(1, "1 failed, 2 passed") == (True, "red")
-    assert mutate.verdict(None, "")[0]
+    assert mutate.verdict(1, "Timeout (0:01:00)!")[0]
     assert mutate.verdict(-6, "")[0]
-    assert not mutate.verdict(0, "3 passed")[0]
+    assert mutate.verdict(0, "1 skipped")[0]
+    assert not mutate.verdict(0, "3 passed, 1 skipped")[0]
     assert not mutate.verdict(2, "error during collection")[0]
     assert not mutate.verdict(1, "1 error in 0.1 s")[0]
 
@@ -96,11 +97,20 @@ def test_the_runner_tells_red_from_green(tmp_path: Path) -> None:
     (tmp_path / "test_doubling.py").write_text(
         "from doubling import double\ndef test_sees(): assert double(3) == 6\ndef test_blind(): assert double(0) == 0\n"
     )
-    seen: dict[str, str] = {}
     for name, expected in (("test_sees", (True, "red")), ("test_blind", (False, "STILL GREEN"))):
         entry = mutate.Mutation("area", "doubling.py", "2 * x", "3 * x", f"test_doubling.py::{name}")
-        assert mutate.judge(tmp_path, entry, seen, 60.0) == expected
+        assert mutate.judge(tmp_path, entry, 60.0) == expected
     assert (tmp_path / "doubling.py").read_text() == "def double(x):\n    return 2 * x\n"
+
+
+def test_changed_source_is_compiled_anew(tmp_path: Path) -> None:
+    """Python takes bytecode for that of a text of equal length and second."""
+    file = tmp_path / "a.py"
+    file.write_text("x = 1\n")
+    before = file.stat()
+    mutate.change_source(file, "x = 2\n")
+    assert int(file.stat().st_mtime) > int(before.st_mtime)
+    assert file.read_text() == "x = 2\n"
 
 
 # -- Faults at random --------------------------------------------------------------------------------------------------
