@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -14,6 +16,7 @@ from mivol.transport.estimators.lighting.direct_lighting import (
     power_heuristic,
 )
 from mivol.transport.estimators.lighting.emitters import EventSamples
+from mivol.transport.estimators.lighting.shadow_rays import trace_shadow_ray
 from mivol.transport.estimators.lighting.vertex import MediumVertex, SurfaceVertex
 from mivol.transport.media.body import medium_interaction
 from scenes import box_of, camera, centred, media_of, medium, sky
@@ -58,6 +61,25 @@ def test_a_wall_under_a_emitter():
     # Rays start a little above the wall: 1e-5 of a scene of 20, and the emitter is that much nearer.
     assert np.array(found.value).ravel() == pytest.approx([0.5 / np.pi * POWER / FAR**2 * np.exp(-DEPTH)] * 3, rel=1e-3)
     assert found.on[0] and not off.on[0] and not np.array(off.value).any()
+
+
+@pytest.mark.parametrize("attached", [False, True])
+def test_a_dark_sample_has_no_shadow_ray_in_images(attached, monkeypatch):
+    """An emitter below the wall, whose light the wall does not scatter upwards; derivatives follow all rays."""
+    module, lanes = sys.modules[DirectLighting.__module__], []
+
+    def trace(media, start, medium, aim, active, rng):
+        lanes.append(bool(active[0]))
+        return trace_shadow_ray(media, start, medium, aim, active, rng)
+
+    monkeypatch.setattr(module, "trace_shadow_ray", trace)
+    for z in (FAR, -FAR):
+        direct, vertex = at_wall(scene(emitter=emitter(z)))
+        with dr.suspend_grad():
+            aim = direct.sample_emitter(vertex.interaction, mi.Point2f(0.5), mi.Bool(True))
+            found = direct.estimate_at_vertex(vertex, aim, attached, mi.Bool(True))
+        assert bool(np.array(found.value).any()) is (z > 0)
+    assert lanes == [True, attached]
 
 
 def test_a_shadow_ray_has_the_derivative_of_its_optical_depth():

@@ -31,7 +31,7 @@ def on_the_wall(media: SceneMedia) -> SurfaceVertex:
 def test_a_diffuse_wall_reflects_by_the_cosine(media):
     """reflectance / pi times the cosine, and the density of directions by the cosine."""
     vertex, d = on_the_wall(media), mi.Vector3f(0.6, 0, 0.8)
-    value, pdf = vertex.eval(d, mi.Bool(True)), vertex.pdf(d, mi.Bool(True))
+    value, pdf = vertex.eval_and_pdf(d, mi.Bool(True))
     np.testing.assert_allclose(np.array(value).ravel(), [0.4 / np.pi] * 3, rtol=ROUNDING)
     assert pdf[0] == pytest.approx(0.8 / np.pi, rel=ROUNDING)
 
@@ -59,8 +59,7 @@ def test_a_point_of_smoke_scatters_by_its_phase_function(media):
     mei = medium_interaction(mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, -1)), mi.Float(2), smoke)
     vertex = MediumVertex(media, mei, mi.Point3d(mei.p))
     for d, expected in ((mi.Vector3f(0, 0, -1), 0.75 / 0.5**3), (mi.Vector3f(1, 0, 0), 0.75 / 1.25**1.5)):
-        found = [np.array(vertex.eval(d, mi.Bool(True))).ravel(), np.array(vertex.pdf(d, mi.Bool(True)))]
-        for value in found:
-            np.testing.assert_allclose(value, expected / (4 * np.pi), rtol=2 * ROUNDING)
+        for value in vertex.eval_and_pdf(d, mi.Bool(True)):
+            np.testing.assert_allclose(np.array(value).ravel(), expected / (4 * np.pi), rtol=2 * ROUNDING)
     start, around = vertex.leave(mi.Point3f(5))
     assert np.array(start).ravel().tolist() == [0, 0, -2] and around == mi.MediumPtr(smoke)

@@ -234,6 +234,10 @@ class DirectLighting:
         """
         direct, it = sample.direct, vertex.interaction
         on = active & (direct.pdf > 0)
+        scattered, pdf = vertex.eval_and_pdf(direct.d, on)
+        if not attached:
+            # A dark sample needs no shadow ray. It may have derivatives, of a BSDF that is 0.
+            on &= dr.any(scattered * sample.weight != 0)
         start, medium = vertex.leave(direct.p)
         shadow, traced = None, on
         if self.shadow_table is not None:
@@ -244,13 +248,12 @@ class DirectLighting:
         on &= clear
         w_mis = mi.Float(1)
         if sample.has_alternative is not False:
-            pdf = vertex.pdf(direct.d, on)
             own = direct.pdf if sample.density is None else sample.density
             w_mis = dr.select(direct.delta | ~mi.Bool(sample.has_alternative), 1, power_heuristic(own, pdf))
-        factor = light * w_mis
+        factor, source = light * w_mis, sample.weight
         with dr.resume_grad(when=attached):
-            source, moved = sample.weight, direct
             if attached:
+                moved = direct
                 placed, source = sample.emitter.sample_direction(it, sample.u, on)
                 if dr.grad_enabled(placed.p):
                     moved = attach_position(placed, direct)
@@ -261,9 +264,10 @@ class DirectLighting:
                 if not dr.grad_enabled(source, moved):
                     # Without derivatives, the first evaluation of the emitter is enough; the kernel drops the second.
                     source, moved = sample.weight, direct
+                scattered = vertex.eval(moved.d, on)
             # A density of 0 makes the source infinite. These lanes are not active, but 0 * inf in their derivative would be
             # NaN.
-            value = dr.select(on, factor * vertex.eval(moved.d, on) * dr.select(direct.pdf > 0, source, 0), 0)
+            value = dr.select(on, factor * scattered * dr.select(direct.pdf > 0, source, 0), 0)
         if shadow is None:
             return DirectSample(ray_segment, value, on)
         shadow = shadow.times(dr.select(traced, 0, value))

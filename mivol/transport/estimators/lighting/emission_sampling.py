@@ -305,9 +305,9 @@ class EmissionSampling:
         rng, (*place, along, chance) = draw_pcg32(rng, 6)
         d = dr.normalize(self.table.sample_point(u, place) - it.p)
         line = self.table.sample_along(it.p, d, along, active)
-        f = dr.detach(vertex.eval(d, active))
+        f, pdf = vertex.eval_and_pdf(d, active)
         on = active & (line.pdf > 0) & (line.density > 0) & dr.any(f != 0)
-        weight = power_heuristic(line.pdf, vertex.pdf(d, on)) / dr.select(on, line.pdf * line.density, 1)
+        weight = power_heuristic(line.pdf, pdf) / dr.select(on, line.pdf * line.density, 1)
         # -- The light that arrives from there ----------------------------------------------------------------------------
         start, medium = vertex.leave(it.p + d * line.t)
         ray = FineRay.from_point(start, d, it, dr.select(on, line.t, 0))

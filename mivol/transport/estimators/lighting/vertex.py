@@ -1,7 +1,7 @@
 """Vertices of a path: a point of a surface with its BSDF, or of a medium with its phase function.
 
-Conventions. ``eval`` is the BSDF times the cosine, or the phase function [1/sr]. ``pdf`` is the density of directions sampled
-at the vertex [1/sr], for weighting emitter samples by multiple importance sampling.
+Conventions. ``eval`` is the BSDF times the cosine, or the phase function [1/sr]. The density of directions sampled at the
+vertex [1/sr] weighs emitter samples by multiple importance sampling.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class Vertex(Protocol):
     def eval(self, d: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
         """BSDF times cosine, or phase function, for light from the direction ``d`` [1/sr], with derivatives."""
 
-    def pdf(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """Density of the direction ``d`` among directions sampled at the vertex [1/sr]."""
+    def eval_and_pdf(self, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
+        """:meth:`eval`, and the density of ``d`` among directions sampled at the vertex [1/sr], without derivatives."""
 
 
 @dataclass
@@ -64,8 +64,8 @@ class SurfaceVertex:
     def eval(self, d: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
         return self.bsdf.eval(mi.BSDFContext(), self.interaction, self.interaction.to_local(d), active)
 
-    def pdf(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        return self.bsdf.eval_pdf(mi.BSDFContext(), self.interaction, self.interaction.to_local(d), active)[1]
+    def eval_and_pdf(self, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
+        return dr.detach(self.bsdf.eval_pdf(mi.BSDFContext(), self.interaction, self.interaction.to_local(d), active))
 
 
 @dataclass
@@ -90,11 +90,7 @@ class MediumVertex:
         return self.media.phases.eval(self.interaction, d, active)
 
     def eval_and_pdf(self, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
-        """Phase function and density of the direction ``d`` [1/sr], without derivatives."""
-        return dr.detach(self.eval(d, active)), self.pdf(d, active)
-
-    def pdf(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        return self.media.phases.pdf(self.interaction, d, active)
+        return dr.detach(self.eval(d, active)), self.media.phases.pdf(self.interaction, d, active)
 
 
 @dataclass
@@ -123,6 +119,7 @@ class MixedVertex:
         scattered = self.medium.eval(d, active & self.in_medium)
         return dr.select(self.in_medium, scattered, self.surface.eval(d, active & ~self.in_medium))
 
-    def pdf(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        scattered = self.medium.pdf(d, active & self.in_medium)
-        return dr.select(self.in_medium, scattered, self.surface.pdf(d, active & ~self.in_medium))
+    def eval_and_pdf(self, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
+        scattered, density = self.medium.eval_and_pdf(d, active & self.in_medium)
+        reflected, pdf = self.surface.eval_and_pdf(d, active & ~self.in_medium)
+        return dr.select(self.in_medium, scattered, reflected), dr.select(self.in_medium, density, pdf)
