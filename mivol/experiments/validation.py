@@ -168,9 +168,10 @@ class Verdict:
     @property
     def words(self) -> str:
         """The verdict in a sentence."""
+        reason = "; the doubt above may be the reason" if self.doubts else ""
         return {
             AGREES: "mivol agrees with Mitsuba's volpath on this scene.",
-            DIFFERS: "mivol differs from Mitsuba's volpath on this scene.",
+            DIFFERS: f"mivol differs from Mitsuba's volpath on this scene{reason}.",
             UNTRUSTED: f"Mitsuba {mi.__version__} is no reference here, so nothing is decided.",
         }[self.code]
 
