@@ -41,6 +41,17 @@ def test_emitters_that_let_light_pass(kind, emitter):
     same({"smoke": grid_in(cube(PLACE)), "transmissive": square(0.8, -0.65, 0.85, 0.6) | light | {"bsdf": mask}, **shine})
 
 
+def test_an_open_ray_ends_at_a_lamp_inside_a_homogeneous_medium():
+    """The optical depth up to the surface of the lamp, not to the end of the medium behind it."""
+    lamp = {"type": "sphere", "radius": 0.25, "emitter": {"type": "area"}}
+    media = media_of(close_up({"fog": box_of(medium("mivol_medium", 1.5, 0.5), PLACE), "lamp": lamp}, res=1))
+    ray = mi.Ray3f(mi.Point3f(-0.75, 0, 0), mi.Vector3f(1, 0, 0))
+    end, tau, _, T = find_transmittance(media, ray, dr.zeros(mi.MediumPtr, 1), mi.Bool(True), None)
+    # The surface of a sphere is found to 1e-5 of the radius.
+    np.testing.assert_allclose([end.t[0], tau[0][0]], [0.5, 0.75], rtol=1e-5)
+    np.testing.assert_allclose(np.array(T).ravel(), np.exp(-0.75), rtol=1e-5)
+
+
 # -- Roulette --------------------------------------------------------------------------------------------------------------
 
 N = 1 << 16

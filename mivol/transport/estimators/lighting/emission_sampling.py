@@ -311,7 +311,7 @@ class EmissionSampling:
         # -- The light that arrives from there ----------------------------------------------------------------------------
         start, medium = vertex.leave(it.p + d * line.t)
         ray = FineRay.from_point(start, d, it, dr.select(on, line.t, 0))
-        end, _, passages, light = find_transmittance(media, ray, medium, on, rng if estimates else None)
+        end, _, passages, light = find_transmittance(media, ray, medium, on, rng if estimates else None, True)
         on &= ~end.si.is_valid()
         inside = [
             (box.body, on & (line.box == k) & _contains_end(box, ray, end.medium)) for k, box in enumerate(self.table.boxes)

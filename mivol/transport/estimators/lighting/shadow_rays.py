@@ -51,7 +51,12 @@ scattering events in cloud and smoke: 1.02 to 1.2 times less than without roulet
 
 
 def find_transmittance(
-    media: SceneMedia, ray: Ray, medium: mi.MediumPtr, active: mi.Bool, rng: mi.UInt32 | None
+    media: SceneMedia,
+    ray: Ray,
+    medium: mi.MediumPtr,
+    active: mi.Bool,
+    rng: mi.UInt32 | None,
+    ends_at_light: bool = False,
 ) -> tuple[SegmentEnd, list[mi.Float] | None, list[mi.Float] | None, mi.Spectrum]:
     """Follow a ray to the first opaque surface, and find its transmittance.
 
@@ -62,6 +67,8 @@ def find_transmittance(
         active: lanes to follow.
         rng: state of the random number generator for an unbiased estimate: by tracking with block ranges or a bounded medium in
             the scene, by roulette otherwise; None means the exact transmittance.
+        ends_at_light: whether the light comes from ``ray.maxt``, so a surface in front makes the result of no use. Rays through
+            dark homogeneous media are then not traced.
 
     Returns:
         The end of the ray; its optical depth for each channel [1], or None if tracking has estimated the transmittance; the
@@ -72,7 +79,8 @@ def find_transmittance(
         end, T = estimate_transmittance(media, ray, medium, active, rng, passes_null=True)
         return end, None, None, T * end.null_transmission
     enough = NEGLIGIBLE_TAU if rng is None else ROULETTE_TAU - dr.log(draw_pcg32(rng, 1)[1][0])
-    end, tau, passages = integrate_optical_depth(media, ray, medium, active, enough, passes_null=True)
+    stops = enough if ends_at_light or not media.is_homogeneous else None
+    end, tau, passages = integrate_optical_depth(media, ray, medium, active, stops, passes_null=True)
     if rng is None:
         return end, tau, passages, transmittance(tau) * end.null_transmission
     # Every channel is divided by the survival probability of the clearest channel, so weights stay below 1.
@@ -157,8 +165,8 @@ def trace_shadow_ray(
     ray = FineRay.from_point(start, dr.normalize(away), direct, length)
     if media.has_solid_surfaces:
         clear = ~media.find_blocked(replace(ray, maxt=length * OWN_SURFACE), active)
-        _, tau, passages, light = find_transmittance(media.alone, ray, medium, active & clear, rng)
+        _, tau, passages, light = find_transmittance(media.alone, ray, medium, active & clear, rng, True)
     else:
-        stop, tau, passages, light = find_transmittance(media, ray, medium, active, rng)
+        stop, tau, passages, light = find_transmittance(media, ray, medium, active, rng, True)
         clear = ~(stop.si.is_valid() & (stop.t < length * OWN_SURFACE))
     return RaySegment(ray, medium, length, True, u, passages), clear, tau, light
