@@ -150,7 +150,13 @@ class Readings(Section):
         | None
     ) = None
     drift: Annotated[
-        int, setting("iteration", "times that an offset and a slope over time are fitted to each pixel; 0: never", ge=0)
+        int,
+        setting(
+            "1",
+            "times that an offset and a slope over time are fitted to each pixel, spread over the iterations (5 or more apart; "
+            "20 from an empty start); no more than chance: nothing changes; 0: never",
+            ge=0,
+        ),
     ] = 0
     zingers: Annotated[
         float, setting("1", "pixels this many deviations brighter or darker than their neighbours are not used; 0: off", ge=0)

@@ -36,6 +36,7 @@ from mivol.experiments.scan_corrections import correction_citations, refine_geom
 from mivol.experiments.solver_choice import (
     GAIN_ITERATIONS,
     ITERATIONS,
+    PLAIN_ITERATIONS,
     check_grid,
     check_noise,
     choose_storage,
@@ -181,7 +182,9 @@ class ScanFit(FitKind):
         record.plan += explain_prior(problem.prior, state)
         if self.data.is_noise_known:
             record.results["discrepancy"] = state.residual_norm / expected_residual_norm(problem, self.settings.solve.name)
+        said = len(self.data.notes)
         self.data = subtract_light(self.problem, self.data, state)
+        record.notes += self.data.notes[said:]
         if isinstance(problem, LeastSquares) and problem.gains is not None:
             size = float(np.std(self.data.removed_rings[0]))
             record.notes.append(f'rings: the gains of the columns scatter by {size:.2%} in the middle row (data.rings = "fit")')
@@ -294,9 +297,13 @@ def subtract_light(problem: ProjectionProblem, data: Projections, state: SolverS
     if problem.light is not None:
         last = LightDrift(*(state.memory[name] for name in ("offset", "slope")))
         change = update_light(task, problem.light, last, state.x).eval(view_times(data))
+        if not change.any():
+            note = 'no drift of the light above chance: nothing is subtracted (data.rings = "gain" removes constant gains)'
+            return replace(data, notes=(*data.notes, note))
         middle = change.shape[1] // 2
         shown = ("drift", data.y[:, middle], (data.y - change)[:, middle])
-        data = replace(data, pictures=(*data.pictures, shown))
+        note = f"the light of a pixel drifts by {np.std(change[-1] - change[0]):.2%} over the scan: subtracted (data.drift)"
+        data = replace(data, pictures=(*data.pictures, shown), notes=(*data.notes, note))
     elif isinstance(task, LeastSquares) and task.gains is not None:
         change = task.gains.fit(task.b - (task.A @ state.x).reshape(task.b.shape))[None]
     else:
@@ -337,7 +344,16 @@ def make_solver(settings: config.ScanExperiment, noise: float | None) -> LinearS
     shared = {name: getattr(solve, name) for name in ("subsets", "relaxation", "decay", "window", "cutoff")}
     if solve.discrepancy:
         shared["stop_norm"] = solve.discrepancy * noise
-    return LinearSolve(solver=solve.name, drift=getattr(settings.data, "drift", 0), **shared)
+    return LinearSolve(solver=solve.name, drift=drift_interval(settings), **shared)
+
+
+def drift_interval(settings: config.ScanExperiment) -> int:
+    """Iterations between two fits of the light's drift; 0: it is not fitted.
+
+    The fits are spread evenly. A volume settles first, else the drift would take up what the volume does not yet explain.
+    """
+    count, solve = getattr(settings.data, "drift", 0), settings.solve
+    return max(solve.iterations // (count + 1), PLAIN_ITERATIONS[solve.start]) if count else 0
 
 
 def data_norm(task: LeastSquares | PoissonCounts) -> float:

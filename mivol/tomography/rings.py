@@ -11,7 +11,7 @@ from scipy.sparse import diags_array, eye_array
 from scipy.sparse.linalg import splu, spsolve
 
 from mivol.errors import MivolError
-from mivol.tomography.preprocess import Transmission, interpolate_gaps
+from mivol.tomography.preprocess import LightDrift, Transmission, fit_light_drift, interpolate_gaps
 
 RING_WIDTHS = {"gain": 14, "sort": 7}
 """Default width [column] by method, chosen by a head and forty ellipsoids in 129 columns with gains of 2 %: 6 and 10 leave more
@@ -37,6 +37,10 @@ GAIN_DEVIATIONS = 3.0
 
 COLUMN_DEVIATIONS = 5.0
 """Deviations above which the offset of a single column counts as a gain: by chance one in 10,000; 6 leave more rings."""
+
+LEAST_DRIFT = 0.5
+"""Variance of slopes over time, over that of their errors, below which a drift is not subtracted. Scans without drift have up
+to 0.3, because their volume does not explain everything; a drift of 0.4 hardly raises the error of a volume."""
 
 ROUNDING = 1e-10
 """Deviation of an offset by rounding, at least."""
@@ -106,27 +110,69 @@ def _subtract_gains(y: np.ndarray, width: int) -> np.ndarray:
 def _share_of_gains(offsets: np.ndarray) -> np.ndarray:
     """Share of each column's offset that gains explain, from its offsets in arcs of the scan (arcs, cols).
 
-    A gain is the same in all arcs; a detail of the object moves to other columns. So the variance of gains is the mean square
-    of the columns' mean offsets, less the variance of these means between arcs. The best linear estimate of a gain is its
-    offset times ``gains / (gains + errors)``.
+    A gain is the same in all arcs; a detail of the object moves to other columns. So the variance of the mean offset is that
+    between arcs.
+    """
+    found, variances = np.mean(offsets, axis=0), np.var(offsets, axis=0, ddof=1) / len(offsets)
+    excess = found**2 - variances
+    by_chance = GAIN_DEVIATIONS * excess.std() / np.sqrt(len(excess))
+    return _share_above_chance(found, variances, excess.mean() if excess.mean() > by_chance else 0.0)
 
-    A few faulty columns hardly raise the variance of all. So a column whose offset exceeds ``COLUMN_DEVIATIONS`` of its own
+
+def _share_above_chance(found: np.ndarray, variances: np.ndarray, true: float) -> np.ndarray:
+    """Share of each pixel's value that is above its error (empirical Bayes).
+
+    The best linear estimate of a true value is the found one times ``true / (true + error)``, with the variance of both.
+
+    A few faulty columns hardly raise the variance of all. So a column whose value exceeds ``COLUMN_DEVIATIONS`` of its own
     deviations counts for itself.
 
+    Args:
+        found: (..., cols).
+        variances: variances of the errors, which are averaged over ``ERROR_COLUMNS``.
+        true: variance of the true values: the mean square of the found values less the mean of ``variances``; 0 if that is
+            chance.
+
     Returns:
-        (cols,); 0 without such a column if the gains of all do not exceed ``GAIN_DEVIATIONS`` standard errors.
+        (..., cols); without ``true``, 0 in all but such columns.
     """
-    squares, variances = np.mean(offsets, axis=0) ** 2, np.var(offsets, axis=0, ddof=1) / len(offsets)
+    squares = found**2
     # Arcs of a noiseless scan may agree to rounding.
     errors = np.maximum(uniform_filter1d(variances, ERROR_COLUMNS, mode="nearest"), ROUNDING**2)
     # Few arcs may agree by chance in a few neighbours: an error counts as at least the median of all.
     is_own = squares > COLUMN_DEVIATIONS**2 * np.maximum(errors, np.median(variances))
     own = np.where(is_own, 1 - errors / np.where(is_own, squares, 1), 0)
-    excess = squares - variances
-    gains = excess.mean()
-    if gains <= GAIN_DEVIATIONS * excess.std() / np.sqrt(len(excess)):
-        return own
-    return np.maximum(gains / (gains + errors), own)
+    return np.maximum(true / (true + errors), own)
+
+
+def fit_drift_above_chance(residual: np.ndarray, weights: np.ndarray, times: np.ndarray) -> LightDrift:
+    """Fit each pixel's drift and reduce it to its share above chance; 0 if the light does not change over time.
+
+    Fits that leave out one arc of the scan each tell the errors of noise and of what the volume does not explain (jackknife).
+
+    Args:
+        residual, weights, times: as in :func:`mivol.tomography.preprocess.fit_light_drift`, of six views or more; fewer have
+            no drift.
+    """
+    arcs = min(ARCS, len(times) // 2)
+    if arcs < FEWEST_ARCS:
+        return LightDrift(*np.zeros((2, *residual.shape[1:])))
+    parts = np.array_split(np.arange(len(times)), arcs)
+    fits = [fit_light_drift(*(np.delete(a, part, 0) for a in (residual, weights, times))) for part in parts]
+    drift = fit_light_drift(residual, weights, times)
+
+    def share(name: str) -> np.ndarray:
+        variances = (arcs - 1) ** 2 / arcs * np.var([getattr(fit, name) for fit in fits], axis=0, ddof=1)
+        found, error = getattr(drift, name), variances.mean()
+        # Single pixels count for themselves.
+        true = np.minimum(found**2, COLUMN_DEVIATIONS**2 * error).mean() - error
+        # The mean square of n normal numbers scatters by sqrt(2 / n) of their variance.
+        least = max(LEAST_DRIFT, GAIN_DEVIATIONS * np.sqrt(2 / found.size)) * error
+        return _share_above_chance(found, variances, true if true > least else 0.0)
+
+    slope = share("slope")
+    # A constant offset alone is no drift: data.rings removes it.
+    return LightDrift(np.where(slope > 0, share("offset"), 0) * drift.offset, slope * drift.slope)
 
 
 def _find_offsets(y: np.ndarray, width: int) -> np.ndarray:

@@ -19,7 +19,7 @@ from mivol.errors import MivolError
 from mivol.tomography.filtered import filtered_backprojection
 from mivol.tomography.preprocess import Transmission
 from mivol.tomography.projector import Projector
-from mivol.tomography.rings import RING_WIDTHS, PixelGains, find_zingers, remove_rings
+from mivol.tomography.rings import RING_WIDTHS, PixelGains, find_zingers, fit_drift_above_chance, remove_rings
 from mivol.validate.metrics import nrmse
 
 
@@ -113,6 +113,37 @@ def test_offsets_that_change_between_arcs_are_no_gains(which: str) -> None:
         np.testing.assert_array_equal(found, y)
     # The published method has no such share, so it changes only rows with gains.
     assert np.array_equal(remove_rings(y, np.ones(y.shape), "sort", 7), y) == (which == "none")
+
+
+@pytest.mark.parametrize("views", [90, 5])
+@pytest.mark.parametrize("which", ["noise", "gains", "object", "drift", "one pixel"])
+def test_drift_is_what_changes_over_time_above_chance(which: str, views: int) -> None:
+    """Noise of 0.01 in 8 x 64 pixels, whose slopes over times from -1 to 1 then err by sqrt(3 / 90) times that, 0.0018.
+
+    Constant gains are no drift, nor is an object whose residual changes within a few views. Slopes of 0.005 have the share
+    1 / (1 + 0.0018^2 / 0.005^2) = 0.88; the variance of 512 normal numbers errs by sqrt(2 / 512) = 6 %, nine arcs by more.
+    """
+    rng, times, shape = np.random.default_rng(7), np.linspace(-1, 1, views), (8, 64)
+    residual = 0.01 * rng.normal(size=(views, *shape))
+    if which == "gains":
+        residual += 0.02 * rng.normal(size=shape)
+    if which == "object":
+        residual += np.repeat(0.02 * rng.normal(size=(-(-views // 5), *shape)), 5, axis=0)[:views]
+    line = np.where(np.arange(512).reshape(shape) == 100, 0.2, 0) if which == "one pixel" else 0.005 * rng.normal(size=shape)
+    if which in ("drift", "one pixel"):
+        residual += (2 + times)[:, None, None] * line
+    drift = fit_drift_above_chance(residual, np.full(residual.shape, 1e4), times)
+    if which in ("noise", "gains", "object") or views == 5:
+        assert not drift.slope.any() and not drift.offset.any()
+    elif which == "one pixel":
+        assert np.flatnonzero(drift.slope).tolist() == np.flatnonzero(drift.offset).tolist() == [100]
+        assert drift.slope.max() == pytest.approx(0.2, abs=0.01)
+    else:
+        share = np.sum(drift.slope * line) / np.sum(line**2)
+        assert share == pytest.approx(0.88, abs=0.04)
+        error = np.std(drift.eval(times) - (2 + times)[:, None, None] * line)
+        # Unreduced: sqrt(2 / 90) of the noise; the root mean square of 512 errors scatters by 3 %.
+        assert error < 1.1 * np.sqrt(2 / 90) * 0.01
 
 
 def test_offsets_of_a_residual_are_its_mean_without_slow_changes() -> None:

@@ -193,8 +193,8 @@ def test_the_load_tooth(variant_rgb: str, data_dir: Path, monkeypatch: pytest.Mo
     result = filtered_backprojection(Projector(scan.beam, scan.grid), scan.y)
     error = scan.error(result)
     others = [scan.error(a) for a in (result[:, ::-1], result[:, :, ::-1], np.roll(result, 1, axis=2), 0 * result)]
-    # By the scene's page conjugate gradients with a prior predict to 1.49 times the noise; the bare filter does not reach that.
-    assert 1.49 < error < min(others)
+    # By the scene's page conjugate gradients with a prior predict to 1.52 times the noise; the bare filter does not reach that.
+    assert 1.52 < error < min(others)
 
 
 def curve(errors: list[float], seconds: list[float]) -> peers.Curve:

@@ -117,6 +117,20 @@ def test_turn_alternates_solver_and_drift(drifting):
     np.testing.assert_array_equal(states[6].x, list(itertools.islice(SOLVERS["pcg"].run(target), 2))[-1].x)
 
 
+def test_without_drift_the_solver_goes_on(scan):
+    """Noise and constant stripes: every volume is that of the solver alone, also when the run is resumed between two fits."""
+    a, _, b = scan
+    rng, columns = np.random.default_rng(3), b.size // VIEWS
+    y = b.reshape(VIEWS, 1, columns) + 0.05 * rng.normal(size=columns) + 0.02 * rng.normal(size=(VIEWS, 1, columns))
+    problem = LeastSquares(a, y, np.ones_like(y), nonnegative=True)
+    alone, states = list(itertools.islice(SOLVERS["pcg"].run(problem), 12)), states_of(problem, 12)
+    resumed = states_of(problem, 5, SolverState.from_arrays(states[6].to_arrays()))
+    for found in (states, [*states[:7], *resumed]):
+        for one, other in zip(alone, found, strict=True):
+            assert one.iteration == other.iteration
+            np.testing.assert_array_equal(one.x, other.x)
+
+
 def test_object_is_recovered_despite_drift(drifting):
     """Of the joint least squares every turn lowers the residual; the object comes nearer to the truth than without."""
     problem, truth = drifting

@@ -3,15 +3,13 @@
 Conventions. Iterative solvers take any operator with ``@`` and ``.T``. Filtered back-projection, in the same form, needs the
 geometry of the scan. It bridges pixels of weight 0, ignores all other weights, and clips nothing. A solver needs products with
 the operator beyond a gradient, and therefore runs separate iterations. :func:`solve_with_light` alternates between object and
-light (block descent): a few iterations of the solver explain ``b - light``, then the light is fitted to the remaining part of
-``b``. Each turn lowers the joint weighted least squares.
+light: a few iterations of the solver explain ``b - light``, then the light is fitted to the remaining part of ``b``.
 
-References: :func:`mivol.tomography.preprocess.fit_light_drift`.
+References: :func:`mivol.tomography.rings.fit_drift_above_chance`.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Annotated, Protocol
@@ -42,8 +40,9 @@ from mivol.optim.projections.linear_problems import (
 )
 from mivol.optim.strategy import setting
 from mivol.tomography.filtered import check_circle, check_parallel, feldkamp, filtered_backprojection
-from mivol.tomography.preprocess import LightDrift, fit_light_drift, interpolate_gaps
+from mivol.tomography.preprocess import LightDrift, interpolate_gaps
 from mivol.tomography.projector import Projector
+from mivol.tomography.rings import fit_drift_above_chance
 
 FilteredBackprojection = Callable[[Projector, np.ndarray, str, float], np.ndarray]
 
@@ -195,12 +194,12 @@ class LightFit(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class DriftFit:
-    """Offset and slope of each pixel; ``times`` preferably centred at 0."""
+    """Offset and slope of each pixel, as far as they exceed chance; ``times`` preferably centred at 0."""
 
     times: np.ndarray
 
     def update(self, light: LightDrift, residual: np.ndarray, weights: np.ndarray) -> LightDrift:
-        return fit_light_drift(residual, weights, self.times)
+        return fit_drift_above_chance(residual, weights, self.times)
 
 
 @dataclass
@@ -340,12 +339,14 @@ def solve_with_light(
 ) -> Iterator[SolverState]:
     """Iterations of a solver, with a new fit of the light after every ``every`` iterations.
 
+    The solver begins anew on what a fitted light leaves. Without any light it goes on, as if the light were known.
+
     Args:
         run: of a least-squares :class:`~mivol.optim.projections.linear_problems.Solver`.
         problem: ``A`` is a projector, ``b`` and ``weights`` are (views, rows, cols).
         light: unknowns of the light.
-        every: iterations of a turn.
-        state: state to resume from; the memory holds the whole turn.
+        every: iterations between two fits.
+        state: state to resume from, with its memory.
         options: options of the solver.
 
     Yields:
@@ -359,17 +360,23 @@ def solve_with_light(
         done, turn = state.iteration, int(memory.pop("turn"))
         own = {name.removeprefix(INNER): value for name, value in memory.items()}
         inner = replace(state, iteration=turn, memory=own)
+    states = run(replace(problem, b=problem.b - drift.eval(light.times)), inner, **options)
     while True:
-        states = run(replace(problem, b=problem.b - drift.eval(light.times)), inner, **options)
-        for inner in itertools.islice(states, every - turn):
-            done, turn = done + 1, turn + 1
-            memory = {INNER + name: value for name, value in inner.memory.items()}
-            drift_memory = {"offset": drift.offset, "slope": drift.slope, "turn": np.asarray(turn)}
-            yield replace(inner, iteration=done, memory=memory | drift_memory)
-        if inner is None:
-            return
-        drift = update_light(problem, light, drift, inner.x)
-        problem, inner, turn = replace(problem, x0=inner.x), None, 0
+        found = None if turn and turn % every == 0 else next(states, None)
+        if found is None:
+            if not turn:
+                return
+            last, drift = drift, update_light(problem, light, drift, inner.x)
+            if any(part.any() for part in (last.offset, last.slope, drift.offset, drift.slope)):
+                problem, turn = replace(problem, x0=inner.x), 0
+                states = run(replace(problem, b=problem.b - drift.eval(light.times)), None, **options)
+            found = next(states, None)
+            if found is None:
+                return
+        inner, done, turn = found, done + 1, turn + 1
+        memory = {INNER + name: value for name, value in inner.memory.items()}
+        drift_memory = {"offset": drift.offset, "slope": drift.slope, "turn": np.asarray(turn)}
+        yield replace(inner, iteration=done, memory=memory | drift_memory)
 
 
 def update_light(problem: LeastSquares, light: LightFit, last: LightDrift, x: np.ndarray) -> LightDrift:
