@@ -276,7 +276,7 @@ def _read_medium_facts(boundary: Boundary, view: MediumView, survey: SceneSurvey
         is_scattering=scatters,
         occupied=occupied,
         tau_max=_bound_optical_depth(boundary, view, reads, survey),
-        tau_min=_find_thinnest(boundary, view),
+        tau_min=_find_thinnest(boundary, view, survey),
         albedo_min=read_lowest_albedo(view, survey, boundary.name),
     )
 
@@ -301,16 +301,20 @@ def _bound_optical_depth(boundary: Boundary, view: MediumView, reads: list[GridR
     constants = [float(np.max(np.array(dr.detach(p.constant)))) for p in view.parts if p.is_constant]
     if boundary.box is None:
         return None
-    scale = read_number(dr.detach(view.scale), survey)
-    return scale * (sum(constants) + sum(bounds) + sum(r.maximum for r in reads)) * boundary.box.diameter
+    return _read_scale(view, survey) * (sum(constants) + sum(bounds) + sum(r.maximum for r in reads)) * boundary.box.diameter
 
 
-def _find_thinnest(boundary: Boundary, view: MediumView) -> float:
+def _read_scale(view: MediumView, survey: SceneSurvey) -> float:
+    """The scale of a medium."""
+    return read_number(dr.detach(view.numbers.get("scale", 1.0)), survey)
+
+
+def _find_thinnest(boundary: Boundary, view: MediumView, survey: SceneSurvey) -> float:
     """The optical depth of a homogeneous medium's clearest channel across its shape [1]; 0 for other media."""
     if boundary.around is None or not all(p.is_constant for p in view.parts):
         return 0.0
     extinction = sum((np.array(dr.detach(p.constant), dtype=np.float64).ravel() for p in view.parts), np.zeros(1))
-    return float(np.min(extinction)) * float(np.min(np.array(dr.detach(view.scale)))) * boundary.around.edge
+    return float(np.min(extinction)) * _read_scale(view, survey) * boundary.around.edge
 
 
 @dataclass(frozen=True)
@@ -456,9 +460,9 @@ class Needs(ShapeFacts):
         """The same facts of the same shapes in other places."""
         return replace(self, boundaries=boundaries, surface_boxes=facts.surface_boxes, lit_box=facts.lit_box)
 
-    def with_views(self, survey: SceneSurvey, phases: list[Phase]) -> Needs:
-        """The same facts with the media viewed anew: a recording reads their arrays from the scene, all but ``phases``."""
-        views = (b.view(survey.grids, phase) for b, phase in zip(self.boundaries, phases, strict=True))
+    def with_views(self, survey: SceneSurvey, phases: list[Phase], scales: tuple[float | None, ...]) -> Needs:
+        """The same facts with the media viewed anew: a recording reads their arrays from the scene, all but these."""
+        views = (b.view(survey.grids, *given) for b, *given in zip(self.boundaries, phases, scales, strict=True))
         return replace(self, views=tuple(views))
 
     def make_media(self, scene: mi.Scene, bodies: Sequence[Body], size: float, tracer: mi.Scene | None) -> SceneMedia:

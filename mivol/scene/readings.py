@@ -292,8 +292,10 @@ def is_scattering(view: MediumView, survey: SceneSurvey, name: str) -> bool:
     return any(high > 0 or dr.grad_enabled(a) for high, a in zip(highest, view.albedo_arrays, strict=True))
 
 
-def read_number(value: mi.Float, survey: SceneSurvey) -> float:
-    """The number of an array of one number, read once for each array: the host waits for all kernels before it reads."""
+def read_number(value: float | mi.Float, survey: SceneSurvey) -> float:
+    """A number, or the number of an array of one, read once for each array: the host waits for all kernels before it reads."""
+    if isinstance(value, float):
+        return value
     if value.state == dr.VarState.Literal:
         return float(value[0])
     return _read_once(survey, ("number",), value, lambda: float(value[0]))

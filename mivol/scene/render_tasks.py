@@ -122,24 +122,30 @@ class PlacementLayout:
 
     Attributes:
         places: index of the first number of each group, by the bytes of the group.
+        scales: scale of the medium in each boundary if Mitsuba holds it as a number. A task reads it here, since a recording made
+            anew finds it by the bytes of the first.
         key: all places that a recording does not follow: those of grids, and of all else among media that emit. Also what the
-            host decides by places: which groups are equal, which boundaries cut grids, and the nodes of the table of shadows.
+            host decides by places: which groups are equal, which boundaries cut grids, which media have a scale of 1, and the
+            nodes of the table of shadows.
     """
 
     places: dict[bytes, int] = field(default_factory=dict)
     key: tuple = ()
+    scales: tuple[float | None, ...] = ()
 
 
 def prepare_placements(needs: Needs, size: float, shadow_nodes: int) -> tuple[mi.Float64 | None, PlacementLayout]:
-    """The numbers of boxes, grids and surfaces as one array, for :func:`mivol.transport.traversal.box.with_placements`.
+    """The numbers of boxes, grids and surfaces, and the scales of stock media, as one array, for :func:`mivol.transport.traversal.box.with_placements`.
 
     Args:
         needs: facts with the views of the media.
         size: size of the scene [length].
         shadow_nodes: nodes along an edge of the table of shadows; 0 without a table.
     """
+    found = (view.numbers.get("scale") for view in needs.views)
+    scales = tuple(scale if isinstance(scale, float) else None for scale in found)
     if is_recording():
-        return None, PlacementLayout()
+        return None, PlacementLayout(scales=scales)
     groups = [np.array([size], np.float64), needs.lit_box]
     nodes, table = place_nodes(needs.lit_box, shadow_nodes)
     groups += [table.from_world, table.to_world[:3]] if shadow_nodes else []
@@ -149,14 +155,16 @@ def prepare_placements(needs: Needs, size: float, shadow_nodes: int) -> tuple[mi
         groups += [np.array([box.edge])] if box is not None else []
         lattices = (part.lattice for part in view.parts if part.lattice is not None)
         grids += [lattice_from_world(lattice.to_world, lattice.res) for lattice in lattices if lattice.to_world is not None]
+    groups += [np.array([scale]) for scale in scales if scale is not None]
     groups += [*(needs.surface_boxes or ()), *grids]
     firsts = np.cumsum([0, *(group.size for group in groups)])
     numbers = copy_aligned(np.concatenate([group.ravel() for group in groups]))
     places = {group.tobytes(): int(k) for group, k in zip(groups[::-1], firsts[-2::-1], strict=True)}
     kept = groups if any(view.emits for view in needs.views) else grids
     key = (*(places[group.tobytes()] for group in groups), *map(cuts_grids, needs.views, boxes, holes), *nodes)
+    key += tuple(scale == 1 for scale in scales)
     key += tuple(group.tobytes() for group in kept)
-    return mi.Float64(numbers), PlacementLayout(places, key)
+    return mi.Float64(numbers), PlacementLayout(places, key, scales)
 
 
 def find_unrecorded(scene: mi.Scene, sensor: mi.Sensor, spp: int, needs: Needs, plan: Plan, for_images: bool) -> str | None:
@@ -182,12 +190,12 @@ class RenderTask(RecordedTask):
         super().__init__()
         self.survey, self.needs, self.plan = opened.survey, opened.needs, opened.plan
         self.spp, self.settings, self.aovs, self.for_images = opened.spp, opened.settings, aovs, for_images
-        self.places = opened.layout.places
+        self.layout = opened.layout
 
     def build_estimators(self, scene: mi.Scene, arrays: PreparedArrays) -> Estimators:
         """Build the planned estimators over the arrays of the scene."""
-        with with_placements(arrays.placements, self.places):
-            needs = self.needs.with_views(self.survey, arrays.phases)
+        with with_placements(arrays.placements, self.layout.places):
+            needs = self.needs.with_views(self.survey, arrays.phases, self.layout.scales)
             if arrays.light is not None:
                 needs = replace(needs, media_light=MediaLight(*arrays.light))
             made = arrays.readings, arrays.tracer, arrays.balls

@@ -18,6 +18,7 @@ import mitsuba as mi
 from mivol.scene.foreign_plugins import UnfollowedStateError, describe_foreign, is_foreign
 from mivol.scene.stand_in import ARRAYS, FOUND_SENSOR, RECORDED_FILM, describe_kind
 from mivol.scene_graph import find_children, list_values, read_value, traverse
+from mivol.transport.media.medium_view import STOCK
 from mivol.transport.media.phases import find_plugins
 from mivol.transport.path.film import find_batch_views
 
@@ -27,10 +28,10 @@ FOLLOWED = ("data", "value")
 PLACES = ("position", "to_world")
 """Names of the parameters that place an emitter."""
 
-SHAPE_PLACES = ("to_world", "vertex_positions", "vertex_normals", "vertex_texcoords")
+SHAPE_PLACES = ("to_world", "vertex_positions", "vertex_normals", "vertex_texcoords", "control_points")
 """Names of the parameters that place a shape."""
 
-PLACED_SHAPES = ("Sphere", "Disk", "Cylinder", "Rectangle")
+PLACED_SHAPES = ("Sphere", "Disk", "Cylinder", "Rectangle", "Instance", "BSplineCurve", "LinearCurve")
 """Classes of the shapes besides meshes whose places a recording follows."""
 
 RECORDED_BACK_ENDS = ("llvm",)
@@ -52,6 +53,7 @@ class SceneState:
         others: all other arrays and numbers.
         of_sensor: the arrays and numbers of the sensor among both.
         lamps, shapes: the places of the emitters, and those of shapes that a recording follows, among both.
+        scales: the scales of stock media, which are numbers, among ``values``.
         held: the arrays. Dr.Jit would give the index of a freed array to another array.
         differentiated: keys of the scene's parameters with gradients enabled, with their owners.
     """
@@ -62,6 +64,7 @@ class SceneState:
     of_sensor: list = field(default_factory=list)
     lamps: list = field(default_factory=list)
     shapes: list = field(default_factory=list)
+    scales: list[float] = field(default_factory=list)
     held: list = field(default_factory=list)
     differentiated: list[tuple[str, mi.Object]] = field(default_factory=list)
 
@@ -121,6 +124,10 @@ class SceneState:
         for key in params.properties:
             value, owner = read_value(params, key), params.properties[key][2]
             numbers = value if dr.is_array_v(value) else getattr(value, "matrix", None)
+            if isinstance(value, float) and owner.class_name() in STOCK:
+                self.scales.append(value)
+                self._sort(owner, True, ((value,), (), False))
+                continue
             if numbers is None or not dr.is_jit_v(numbers):
                 self._sort(owner, False, value if isinstance(value, int | float | str | bool) else str(value))
                 continue

@@ -313,6 +313,7 @@ class Session:
         if known is None or not known.is_like(state, spp) or any(m.emits for m in known.needs.media):
             return None
         needs, arrays, has_moved = known.needs, known.arrays, survey is not known.survey
+        is_placed_anew = has_moved or state.scales != known.state.scales
         if has_moved:
             boundaries = (*survey.boundaries, *needs.boundaries[len(known.survey.boundaries) :])
             needs = needs.follow_shapes(boundaries, survey.facts)
@@ -329,7 +330,7 @@ class Session:
                 return None
             arrays = replace(arrays, balls=read_balls(scene))
         viewed, layout = replace(needs, views=views), known.layout
-        if has_moved:
+        if is_placed_anew:
             placements, layout = prepare_placements(viewed, survey.size, known.plan.shadow_nodes)
             arrays = replace(arrays, placements=placements, tracer=survey.usable_tracer)
         arrays = replace(arrays, readings=read_parts(viewed, known.plan, survey, for_images))
@@ -351,7 +352,8 @@ class Session:
         if not self.is_depth_given:
             warn_of_last_order(scene, sensor, needs, plan, survey, settings)
         light = None if needs.media_light is None else (needs.media_light.density, needs.media_light.cumulative)
-        if not is_recording() and known is not None and known.survey is survey and known.state.others == state.others:
+        is_known = known is not None and known.survey is survey and known.state.others == state.others
+        if not is_recording() and is_known and known.state.scales == state.scales:
             placements, layout = known.arrays.placements, known.layout
         else:
             placements, layout = prepare_placements(needs, survey.size, plan.shadow_nodes)

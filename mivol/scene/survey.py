@@ -292,12 +292,14 @@ def _find_endless_media(boundaries: Sequence[Boundary], shapes: Sequence[mi.Shap
 
 
 def _read_placement(shape: mi.Shape) -> object:
-    """The placement of a shape: the array of a mesh's vertices, else the matrix or the bounding box."""
+    """The placement of a shape: the array of its points, else the matrix; of an instance, whose group may move inside, and of
+    other shapes the bounding box."""
     params = traverse(shape)
     # A rectangle is a mesh, but does not expose its vertices.
-    if "vertex_positions" in params:
-        return dr.detach(params["vertex_positions"])
-    return dr.detach(params["to_world"].matrix) if "to_world" in params else [*shape.bbox().min, *shape.bbox().max]
+    points = next((params[name] for name in ("vertex_positions", "control_points") if name in params), None)
+    if points is None and "to_world" in params and not is_instance(shape):
+        points = params["to_world"].matrix
+    return [*shape.bbox().min, *shape.bbox().max] if points is None else dr.detach(points)
 
 
 def _has_glass(surfaces: Sequence[mi.Shape]) -> bool:
@@ -492,14 +494,14 @@ class Boundary:
         box = None if self.box is None else self.box.is_round
         return self.medium.ptr, self.name, self.shape, box, self.level, self.hole is None, self.around is None
 
-    def view(self, grids: StockGrids, phase: Phase | None = None) -> MediumView:
+    def view(self, grids: StockGrids, phase: Phase | None = None, scale: float | None = None) -> MediumView:
         """View the medium as a sum of fields; arguments as in :func:`mivol.transport.media.medium_view.view_medium`.
 
         Raises:
             MivolError: a medium that mivol does not render.
         """
         box = None if self.box is None or self.box.is_round else self.box
-        return view_medium(self.medium, box, grids, self.level, phase)
+        return view_medium(self.medium, box, grids, self.level, phase, scale)
 
     def body(self, view: MediumView, estimates_shadows: bool = False) -> Body:
         """Place a view of the medium inside its boundary."""

@@ -32,7 +32,7 @@ from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridE
 from mivol.transport.media.octree_extinction import LeafField, OctreeExtinction
 from mivol.transport.media.phases import HenyeyGreenstein, Isotropic, Microflakes, Phase, PluginPhase, read_phase
 from mivol.transport.media.stock_grids import StockGrids
-from mivol.transport.traversal.box import Box
+from mivol.transport.traversal.box import Box, opaque_numbers
 from mivol.transport.traversal.lattice import Lattice
 
 __all__ = ["ASYMMETRY", "MediumView", "nested_field", "view_medium"]
@@ -126,6 +126,7 @@ def view_medium(
     grids: StockGrids | None = None,
     level: int = 0,
     phase: Phase | None = None,
+    scale: float | None = None,
 ) -> MediumView:
     """View a medium as a sum of fields.
 
@@ -136,6 +137,7 @@ def view_medium(
         grids: what is known of the stock grids, to read and to extend; by default nothing.
         level: level of a nested radiance field.
         phase: the phase function, if it was read before.
+        scale: the scale, if it is a number and was read before.
 
     Raises:
         MivolError: a medium or a volume of another kind.
@@ -148,7 +150,9 @@ def view_medium(
     values = list_values(params)
     names = [n for n in ("sigma_t", "sigma_a", "sigma_s") if n in children]
     grids = StockGrids() if grids is None else grids
-    scale = _read_scale(params["scale"]) if "scale" in params.properties else mi.Float(1)
+    if scale is None:
+        scale = params["scale"] if "scale" in params.properties else 1.0
+    scale = _read_scale(scale)
     parts = [_part(name, params, children[name], kind, scale, boundary, grids) for name in names]
     of_albedo = "sigma_s." if "sigma_s" in names else "albedo."
     own = {k: v for k, v in values if k.startswith(of_albedo)}
@@ -193,7 +197,8 @@ def view_medium(
 
 def _read_scale(scale: float | mi.Float) -> mi.Float:
     """A scale as an array. A literal other than 1 would make a new kernel for each number of a stock medium."""
-    return dr.opaque(mi.Float, scale) if isinstance(scale, float) and scale != 1 else mi.Float(scale)
+    is_number = isinstance(scale, float) and scale != 1
+    return mi.Float(opaque_numbers(np.array([scale]))[0]) if is_number else mi.Float(scale)
 
 
 def _check_microflakes(phase: Phase) -> None:
