@@ -26,6 +26,7 @@ from mivol.scene.previews import (
     measure_noise,
 )
 from mivol.scene.render_tasks import find_unrecorded
+from mivol.scene.scene_state import list_fixed_numbers
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import survey_scene
 from mivol.scene_graph import traverse_children
@@ -214,7 +215,11 @@ def choose_recording(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, plan: Pla
     """Whether images, or gradients, are recorded in their first call and replayed in later ones."""
     reason = find_unrecorded(scene, sensor, 0, needs, plan, for_images)
     choice = "recorded in the first call, then replayed" if reason is None else "traced in every call"
-    followed = "a recording follows values, cameras and seeds that change between calls"
+    fixed = ", ".join(["the film", "the number of samples", *list_fixed_numbers(scene)])
+    followed = (
+        "a recording follows values, places, cameras and seeds that change between calls; each change of these is recorded "
+        f"anew: {fixed}"
+    )
     return Choice("images" if for_images else "gradients", choice, reason or followed)
 
 

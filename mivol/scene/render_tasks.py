@@ -122,8 +122,8 @@ class PlacementLayout:
 
     Attributes:
         places: index of the first number of each group, by the bytes of the group.
-        scales: scale of the medium in each boundary if Mitsuba holds it as a number. A task reads it here, since a recording made
-            anew finds it by the bytes of the first.
+        scales: scale of the medium in each boundary if Mitsuba holds it as a number. A task keeps the first, whose bytes
+            lead to the present one.
         key: all places that a recording does not follow: those of grids, and of all else among media that emit. Also what the
             host decides by places: which groups are equal, which boundaries cut grids, which media have a scale of 1, and the
             nodes of the table of shadows.
@@ -135,7 +135,9 @@ class PlacementLayout:
 
 
 def prepare_placements(needs: Needs, size: float, shadow_nodes: int) -> tuple[mi.Float64 | None, PlacementLayout]:
-    """The numbers of boxes, grids and surfaces, and the scales of stock media, as one array, for :func:`mivol.transport.traversal.box.with_placements`.
+    """The numbers of boxes, grids and surfaces, and the scales of stock media, as one array.
+
+    For :func:`mivol.transport.traversal.box.with_placements`.
 
     Args:
         needs: facts with the views of the media.

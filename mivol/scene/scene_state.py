@@ -106,6 +106,10 @@ class SceneState:
         """Whether no parameter differs, and the sensor is the same."""
         return self.sensor is other.sensor and self.values == other.values and self.others == other.others
 
+    def has_same_rest(self, other: SceneState) -> bool:
+        """Whether nothing differs but values that a recording follows, and the sensor."""
+        return self.others[:-1] == other.others[:-1]
+
     def has_same_numbers(self, other: SceneState) -> bool:
         """Whether no parameter differs except by gradients that a recording follows, and the sensor is the same."""
         numbers, others = ([value[:2] for value in state.values] for state in (self, other))
@@ -189,6 +193,13 @@ def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:
         key for key, value in list_values(params) if find_gradient_array(value) is not None and not _is_followed(params, key)
     ]
     return f"a recording does not follow the derivative by {lost[0]}" if lost else None
+
+
+def list_fixed_numbers(scene: mi.Scene) -> list[str]:
+    """Keys of the numbers of BSDFs that are part of Mitsuba's kernels, such as a refractive index."""
+    params = traverse(scene)
+    numbers = ((key, params.properties[key][2], value) for key, value in list_values(params))
+    return [key for key, owner, value in numbers if isinstance(owner, mi.BSDF) and isinstance(value, float)]
 
 
 def find_gradient_array(value: Any) -> Any | None:

@@ -1,7 +1,7 @@
 """A session renders scenes with one set of settings: facts, plan, walk and film, and the same way back for derivatives.
 
-Conventions. A session belongs to one integrator. The session keeps only the survey of the last scene, so the same integrator
-may render one scene after the other.
+Conventions. A session belongs to one integrator. The session keeps the surveys of the last ``MAX_SCENES`` scenes, so the same
+integrator may render one scene after the other.
 
 Derived values. Plugins compute textures and tables from their parameters when a parameter changes. Dr.Jit follows the edge from
 a parameter to a derived value only once, and never from inside a loop. So a reverse pass first recomputes the derived values
@@ -11,9 +11,10 @@ reads them. Extinction needs neither: transport reads extinction from the parame
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -67,14 +68,26 @@ class _SurveyedScene:
     """The survey of a scene, and the shapes and emitters by which the scene is recognised.
 
     The scene itself is not kept: the scene may hold the integrator of this session, and then neither would ever be freed.
-    ``is_joined`` tells whether the scene and its tracer share their arrays. ``sources`` are the objects of whose parameters
-    plugins compute values, by pointer; None before the first gradient.
+
+    Attributes:
+        parts: the shapes and emitters.
+        survey: where they are.
+        is_joined: whether the scene and its tracer share their arrays.
+        sources: the objects of whose parameters plugins compute values, by pointer; None before the first gradient.
+        opened: the plans for images (True) and for derivatives (False).
+        stand_ins: sensors with their stand-ins, by pointer and facts. With the sensor: another one could get its pointer.
+        views: of the last image, for its derivatives; kept longer, they would keep the derivatives of an earlier step.
+        number: tells the recordings of scenes apart.
     """
 
     parts: list[mi.Object]
     survey: SceneSurvey
     is_joined: bool = False
     sources: set[int] | None = None
+    opened: dict[bool, PlannedScene] = field(default_factory=dict)
+    stand_ins: dict[tuple, tuple[mi.Sensor, StandIn | None]] = field(default_factory=dict)
+    views: tuple[MediumView, ...] = ()
+    number: int = field(default_factory=itertools.count().__next__)
 
     def derives_from(self, scene: mi.Scene, differentiated: Sequence[tuple[str, mi.Object]]) -> bool:
         """Whether plugins compute values from differentiated parameters (keys and owners) of the scene."""
@@ -90,6 +103,9 @@ class _SurveyedScene:
 OUT_OF_MEMORY = "out of memory"
 """Words of Dr.Jit's error when the system or the GPU has no more memory."""
 
+MAX_SCENES = 2
+"""Most scenes of which a session keeps plans and recordings, such as one to fit and one to judge by."""
+
 MAX_RECORDINGS = 256
 """Largest number of recordings: an image and a gradient from each of 128 cameras."""
 
@@ -104,7 +120,7 @@ class Session:
             a warning says so.
 
     Attributes:
-        recordings: recorded images and gradients of the last scene.
+        recordings: recorded images and gradients of the last scenes.
 
     Raises:
         MivolError: an unknown AOV, or a repeated name.
@@ -115,11 +131,8 @@ class Session:
         self.is_depth_given = is_depth_given
         self.aovs = parse_aovs(aovs)
         self.recordings = Recordings(MAX_RECORDINGS)
-        self._surveyed: _SurveyedScene | None = None
-        self._opened: dict[bool, PlannedScene] = {}
-        self._stand_ins: dict[tuple, tuple[mi.Sensor, StandIn | None]] = {}
-        # Of the last image, for its derivatives; kept longer, they would keep the derivatives of an earlier step.
-        self._views: tuple[MediumView, ...] = ()
+        # The last is the one of the present render.
+        self._scenes: list[_SurveyedScene] = []
 
     def __repr__(self) -> str:
         s = self.settings
@@ -213,7 +226,7 @@ class Session:
         self._reset(given[1])
         gradients = [(value, dr.grad(value)) for value in attached]
         try:
-            found = self.recordings.call(kind, (opened.spp, *opened.key), make, *given)
+            found = self.recordings.call(kind, (self._surveyed.number, opened.spp, *opened.key), make, *given)
             if stand_in is not None and kind is not GradientTask:
                 stand_in.give_film(sensor, self.aovs)
             return found
@@ -237,16 +250,30 @@ class Session:
         self, scene: mi.Scene, sensor: mi.Sensor, for_images: bool, attached: list[Any] | None = None
     ) -> SceneState:
         """Read the state of the parameters (:meth:`SceneState.of`)."""
-        known = self._opened.get(for_images)
+        known = self._opened.get(for_images) if self._turn_to(_list_parts(scene)) else None
         return SceneState.of(scene, sensor, attached, None if known is None else known.state)
+
+    @property
+    def _surveyed(self) -> _SurveyedScene:
+        """The scene of the present render."""
+        return self._scenes[-1]
+
+    @property
+    def _opened(self) -> dict[bool, PlannedScene]:
+        """The plans of the scene of the present render."""
+        return self._surveyed.opened
+
+    def _turn_to(self, parts: list[mi.Object]) -> bool:
+        """Make the scene of these shapes and emitters the one of the present render; false for an unknown scene."""
+        self._scenes.sort(key=lambda one: one.is_of(parts))
+        return bool(self._scenes) and self._surveyed.is_of(parts)
 
     def _find_stand_in(self, sensor: mi.Sensor, state: SceneState) -> StandIn | None:
         """The camera to render in the place of a sensor; None for the sensor itself."""
-        key = sensor.ptr, state.sensor_facts
-        if key not in self._stand_ins:
-            # With the sensor: another one could get its pointer.
-            self._stand_ins[key] = sensor, StandIn.find(sensor)
-        return self._stand_ins[key][1]
+        key, known = (sensor.ptr, state.sensor_facts), self._surveyed.stand_ins
+        if key not in known:
+            known[key] = sensor, StandIn.find(sensor)
+        return known[key][1]
 
     def _reset(self, sensor: mi.Sensor) -> None:
         """Bring the film and the sampler into a state that does not depend on what was rendered before.
@@ -272,23 +299,24 @@ class Session:
 
     def _survey(self, scene: mi.Scene, state: SceneState) -> _SurveyedScene:
         """Survey a new scene, or follow the shapes of a known one."""
-        parts, kept = [*scene.shapes(), *scene.emitters()], self._surveyed
-        moved = None
-        if kept is not None and kept.is_of(parts):
+        parts = _list_parts(scene)
+        kept = self._surveyed if self._turn_to(parts) else None
+        if kept is not None:
             # One of the two may be of an earlier place.
-            now = [opened.state for opened in self._opened.values() if opened.survey is kept.survey]
-            alike = [known for known in now if known.others == state.others]
+            now = [opened.state for opened in kept.opened.values() if opened.survey is kept.survey]
+            alike = [known for known in now if known.has_same_rest(state)]
             if any(known.shapes == state.shapes for known in alike) or kept.survey.is_current:
                 return kept
             moved = kept.survey.follow_shapes(scene) if alike else None
-        if moved is not None:
-            kept.survey = moved
-        else:
-            self._surveyed = _SurveyedScene(parts, survey_scene(scene))
-            self._opened, self._stand_ins = {}, {}
+            if moved is not None:
+                kept.survey = moved
+                return kept
+        others = [one for one in self._scenes if one is not kept]
+        if kept is not None or len(others) == MAX_SCENES:
             self.recordings.clear()
-            if not is_recording():
-                evaluate_samplers()
+        self._scenes = [*others[1 - MAX_SCENES :], _SurveyedScene(parts, survey_scene(scene))]
+        if not is_recording():
+            evaluate_samplers()
         return self._surveyed
 
     def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, state: SceneState, for_images: bool) -> PlannedScene:
@@ -298,7 +326,7 @@ class Session:
             return self._plan(scene, sensor, spp, state, for_images)
         if for_images in self._opened and self._opened[for_images].is_for(state, spp):
             return self._opened[for_images]
-        views, self._views = self._views, ()
+        views, self._surveyed.views = self._surveyed.views, ()
         opened = self._open_like_image(scene, sensor, spp, state, views) if views and not for_images else None
         opened = opened or self._renew(scene, sensor, spp, state, for_images)
         opened = opened or self._plan(scene, sensor, spp, state, for_images)
@@ -334,7 +362,7 @@ class Session:
             placements, layout = prepare_placements(viewed, survey.size, known.plan.shadow_nodes)
             arrays = replace(arrays, placements=placements, tracer=survey.usable_tracer)
         arrays = replace(arrays, readings=read_parts(viewed, known.plan, survey, for_images))
-        self._views = views if for_images else ()
+        self._surveyed.views = views if for_images else ()
         return replace(known, state=state, survey=survey, needs=needs, arrays=arrays, layout=layout)
 
     def _plan(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, state: SceneState, for_images: bool) -> PlannedScene:
@@ -359,7 +387,7 @@ class Session:
             placements, layout = prepare_placements(needs, survey.size, plan.shadow_nodes)
         readings, balls = read_parts(needs, plan, survey, for_images), None if is_recording() else read_balls(scene)
         arrays = PreparedArrays(readings, light, find_batch_views(sensor), placements, survey.usable_tracer, balls)
-        self._views = needs.views if for_images and not is_recording() else ()
+        self._surveyed.views = needs.views if for_images and not is_recording() else ()
         facts = replace(needs, views=(), media_light=None)
         opened = PlannedScene(state, spp, survey, facts, plan, arrays, settings, layout)
         return self._find_unrecorded(opened, scene, for_images)
@@ -397,6 +425,11 @@ class Session:
         else:
             opened.unrecorded = find_unrecorded(scene, opened.state.sensor, spp, opened.needs, opened.plan, for_images)
         return opened
+
+
+def _list_parts(scene: mi.Scene) -> list[mi.Object]:
+    """The shapes and emitters by which a scene is recognised."""
+    return [*scene.shapes(), *scene.emitters()]
 
 
 def _find_renderable_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:

@@ -99,8 +99,8 @@ class ShapeFacts:
         stops_rays: whether every traced boundary of a medium stops or turns all rays, so that a segment stays in one medium.
         has_glass: whether a surface is smooth glass, and every surface that only mirrors and transmits is.
         flipped: whether the normals of each shape are flipped, as by a mirrored transform.
-        surface_boxes: (3, 4) maps from the world to cubes [-1, 1]^3 around the ``surfaces``; None for many surfaces, or with a
-            traced boundary of a medium.
+        surface_boxes: (3, 4) maps from the world to cubes [-1, 1]^3 around the ``surfaces``; None for many surfaces, with
+            instances, or with a traced boundary of a medium.
         lit_box: corners (2, 3) of the box around the boundaries of media [length]
             (:func:`mivol.transport.estimators.lighting.emitters.find_lit_box`).
     """
@@ -252,14 +252,15 @@ def survey_scene(scene: mi.Scene, before: SceneSurvey | None = None) -> SceneSur
     solid = [*surfaces, *(s for s in edges if _is_bare(s))]
     # A GPU traces rays in hardware.
     follows = mi.variant().startswith("llvm") and 0 < len(solid) <= MAX_FOLLOWED_SURFACES and not is_recording()
-    # Mitsuba cannot put an instance into another scene.
-    is_traced_alone = follows and boxed and not any(is_instance(s) for s in solid)
+    # Mitsuba cannot put an instance into another scene, and keeps its box if a shape of its group moves.
+    has_instances = any(is_instance(s) for s in solid)
+    is_traced_alone = follows and boxed and not has_instances
     if moved is not None and not any(s.ptr in moved for s in solid):
         tracer = before.tracer
     else:
         tracer = _make_tracer(solid) if is_traced_alone else None
     # Inside of a traced boundary, every ray meets its box.
-    has_boxes = follows and all(b.box or b.shape == OUTSIDE_SHAPES for b in boundaries)
+    has_boxes = follows and not has_instances and all(b.box or b.shape == OUTSIDE_SHAPES for b in boundaries)
     pieces = tuple(rows for s in solid for rows in _surface_boxes(s)) if has_boxes else ()
     marked = [s for s in shapes if s.is_medium_transition() or follows]
     marks = tuple((s, _read_placement(s)) for s in marked)
@@ -292,12 +293,11 @@ def _find_endless_media(boundaries: Sequence[Boundary], shapes: Sequence[mi.Shap
 
 
 def _read_placement(shape: mi.Shape) -> object:
-    """The placement of a shape: the array of its points, else the matrix; of an instance, whose group may move inside, and of
-    other shapes the bounding box."""
+    """The placement of a shape: the array of its points, else the matrix or the bounding box."""
     params = traverse(shape)
     # A rectangle is a mesh, but does not expose its vertices.
     points = next((params[name] for name in ("vertex_positions", "control_points") if name in params), None)
-    if points is None and "to_world" in params and not is_instance(shape):
+    if points is None and "to_world" in params:
         points = params["to_world"].matrix
     return [*shape.bbox().min, *shape.bbox().max] if points is None else dr.detach(points)
 

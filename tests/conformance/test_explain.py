@@ -77,11 +77,12 @@ def test_a_surface_in_a_medium_does_not_hide_it():
 
 @pytest.mark.parametrize(("for_images", "subject"), [(True, "images"), (False, "gradients")])
 def test_what_is_not_recorded_is_traced_with_its_reason(monkeypatch: pytest.MonkeyPatch, for_images: bool, subject: str):
+    scene = mi.load_dict({"type": "scene", "pane": {"type": "rectangle", "bsdf": {"type": "dielectric"}}})
     for unrecorded, choice in ((None, "recorded in the first call"), ("a GPU", "traced in every call")):
         monkeypatch.setattr("mivol.scene.explain.find_unrecorded", lambda *_, found=unrecorded: found)
-        found = choose_recording(None, None, None, None, for_images)
+        found = choose_recording(scene, None, None, None, for_images)
         assert found.subject == subject and found.choice.startswith(choice)
-        assert found.reason == (unrecorded or "a recording follows values, cameras and seeds that change between calls")
+        assert found.reason == unrecorded or found.reason.endswith("anew: the film, the number of samples, pane.bsdf.eta")
 
 
 @pytest.mark.parametrize("volume", ["grid", "hash grid"])

@@ -486,7 +486,7 @@ def smoke_in_the_sun() -> mi.Scene:
 def among_copies() -> mi.Scene:
     """Smoke beside a copy of a ball."""
     group = {"type": "shapegroup", "ball": {"type": "sphere", "radius": 0.3}}
-    place = mi.ScalarTransform4f().translate([0.9, -1.4, 0.8])
+    place = mi.ScalarTransform4f().translate([0.9, -1.4, 0.4])
     return among_shapes(group=group, copy={"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": place})
 
 
@@ -521,7 +521,9 @@ MOVED_SHAPES: dict[str, tuple[Callable[[], mi.Scene], str, str]] = {
 """A scene, a parameter that places a shape, and a parameter to differentiate."""
 
 
-@pytest.mark.parametrize("name", cases(MOVED_SHAPES, slow=set(MOVED_SHAPES) - {"ball", "block", "box of fog", "shape of a copy"}))
+@pytest.mark.parametrize(
+    "name", cases(MOVED_SHAPES, slow=set(MOVED_SHAPES) - {"ball", "block", "box of fog", "shape of a copy"})
+)
 def test_the_place_of_a_shape_is_followed(name: str) -> None:
     """Images to the last bit as by an integrator that has seen no other place; gradients to the rounding of their sums."""
     make, key, differentiated = MOVED_SHAPES[name]
@@ -555,6 +557,36 @@ def place_shape(pair: Pair, key: str, start: object, x: float) -> None:
     """Move a shape from its first place."""
     pair.params[key] = start + x if dr.is_array_v(start) else mi.AffineTransform4f().translate([x, x, x]) @ start
     pair.params.update()
+
+
+def test_a_shape_of_a_copy_moves_out_of_its_box() -> None:
+    """Mitsuba keeps the box of the copy. The picture is the one of a scene that was loaded with the shape in its last place."""
+    images = []
+    for start in (0.0, 1.0):
+        ball = {"type": "sphere", "radius": 0.3, "center": [0, 0, start]}
+        copy = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+        place = mi.ScalarTransform4f().translate([0.9, -1.4, -0.6])
+        parts = {"group": {"type": "shapegroup", "ball": ball}, "copy": copy | {"to_world": place}}
+        pair = Pair(smoke_under(sky=sky(0.7), **parts), 3)
+        pair.assert_same(1)
+        pair.params["group.ball.to_world"] = mi.AffineTransform4f().translate([0, 0, 1]).scale(0.3)
+        pair.params.update()
+        pair.assert_same(1)
+        images.append(pair.images(1)[0])
+    assert np.array_equal(*images)
+
+
+def test_a_curve_bends_inside_of_its_bounds() -> None:
+    pair, sums = Pair(among_curves("linearcurve"), 3), set()
+    # Embree reads points of curves as packets, so they must lie at addresses that Dr.Jit chooses, not NumPy.
+    start, middle = dr.detach(pair.params["curve.control_points"]), mi.Float(np.arange(20) == 3 * 4 + 2)
+    for z in (0.0, 0.1, 0.15, -0.1):
+        pair.params["curve.control_points"] = start + z * middle
+        pair.params.update()
+        truth = mi.render(pair.scene, integrator=mi.load_dict(mivol(max_depth=3)), seed=1, spp=2)
+        assert np.array_equal(pair.images(1)[0], np.array(truth))
+        sums.add(pair.images(1)[0].sum())
+    assert len(sums) == 4
 
 
 def chequered_floor() -> mi.Scene:
@@ -819,6 +851,40 @@ def test_the_cameras_of_a_scene_are_recorded_once(kind: str) -> None:
             recorded = np.array(mi.render(pair.scene, integrator=pair.recorded, sensor=number, seed=9, spp=2))
             np.testing.assert_array_equal(np.array(cameras[number].film().develop()), recorded)
     assert pair.recordings.count == 1
+
+
+@pytest.mark.slow
+def test_cameras_of_two_kinds_in_turns_keep_their_recordings() -> None:
+    """A number of the floor becomes an array on the way: it has not moved for either camera."""
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(4)}
+    lens = camera((2, -2, 1), (0, 0, 0), res=6) | {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 3.0}
+    pair, counts = Pair(smoke_under(sky=sky(0.7), floor=floor, lens=lens), 3), []
+    for call in range(14):
+        pair.assert_same(call, sensor=call % 2)
+        counts.append(pair.recordings.count)
+    assert counts == sorted(counts) and counts[9] == counts[13] > 0
+
+
+def test_two_scenes_in_turns_keep_their_recordings() -> None:
+    """Also if the image of the other comes before the gradient. A third scene frees them."""
+    one, other = (Pair(fog_in({"type": "sphere"}), 3) for _ in range(2))
+    other.recorded, key, counts = one.recorded, INSIDE + "sigma_t.value.value", []
+    other.scale(key, 2.0)
+    for call in range(8):
+        for pair in (one, other):
+            pair.scale(key, 0.95)
+            pair.assert_same(call)
+        with one.differentiated(key) as value:
+            loss = dr.mean(mi.render(one.scene, one.params, integrator=one.recorded, seed=call, spp=2), axis=None)
+            other.assert_same(call + 1)
+            dr.backward(loss)
+            found = np.array(dr.ravel(dr.grad(value)))
+        truth = one.gradient(one.traced, key, call)
+        assert np.abs(found - truth).max() <= 432 * 2**-24 * np.abs(truth).max() > 0
+        counts.append(one.recordings.count)
+    assert counts[4] == counts[7] > 3
+    mi.render(lamp_in_fog(), integrator=one.recorded, spp=2)
+    assert one.recordings.count < counts[7]
 
 
 @pytest.mark.parametrize("kind", LENSES)
@@ -1256,7 +1322,8 @@ def test_the_state_of_a_scene_tells_values_from_the_rest() -> None:
     assert before.is_same(SceneState.of(scene, sensor))
     for key, value, is_followed in (
         (INSIDE + "sigma_t.data", params[INSIDE + "sigma_t.data"] * 2, True),
-        (INSIDE + "scale", 3.0, False),
+        (INSIDE + "scale", 3.0, True),
+        ("sensor.far_clip", 50.0, False),
     ):
         params[key] = value
         params.update()
