@@ -125,8 +125,8 @@ class PlacementLayout:
         scales: scale of the medium in each boundary if Mitsuba holds it as a number. A task keeps the first, whose bytes
             lead to the present one.
         key: all places that a recording does not follow: those of grids, and of all else among media that emit. Also what the
-            host decides by places: which groups are equal, which boundaries cut grids, which media have a scale of 1, and the
-            nodes of the table of shadows.
+            host decides by places: which groups are equal, which boundaries cut grids or are upright, which media have a scale
+            of 1, and the nodes of the table of shadows.
     """
 
     places: dict[bytes, int] = field(default_factory=dict)
@@ -165,6 +165,7 @@ def prepare_placements(needs: Needs, size: float, shadow_nodes: int) -> tuple[mi
     kept = groups if any(view.emits for view in needs.views) else grids
     key = (*(places[group.tobytes()] for group in groups), *map(cuts_grids, needs.views, boxes, holes), *nodes)
     key += tuple(scale == 1 for scale in scales)
+    key += tuple(box is not None and box.is_upright for box in boxes)
     key += tuple(group.tobytes() for group in kept)
     return mi.Float64(numbers), PlacementLayout(places, key, scales)
 

@@ -613,6 +613,12 @@ PLACED_ANEW: dict[str, tuple[Callable[[], mi.Scene], str, str, list]] = {
     "half a turn": (chequered_floor, "floor.to_world", "scale", [(1,), ([-1, -1, 1],)]),
     "mirrored": (inside_a_ball, "ball.to_world", "scale", [(1,), (0.9,), (0.95,), (0.85,), ([-1, 1, 1],)]),
     "lamp in smoke": (among_shapes, "lamp.to_world", "translate", [([-0.5, 1, z],) for z in (0, -2.9, -0.1)]),
+    "tilted": (
+        lambda: fog_in({"type": "cube"}),
+        "smoke.vertex_positions",
+        "rotate",
+        [([0, 0, 1], angle) for angle in (0.0, 20.0, 21.0, 0.0)],
+    ),
     "glow": (glowing_box, "smoke.vertex_positions", "translate", [([x, 0, 0],) for x in (0, 0.1, 0.2)]),
     "balls apart": (
         lambda: among_shapes(other={"type": "sphere", "center": [1.0, -1.5, 0.9], "radius": 0.2}),

@@ -30,7 +30,17 @@ from mivol.transport.media.extinction import (
 )
 from mivol.transport.media.grid_extinction import SummedExtinction, add_to_cell, have_same_cells
 from mivol.transport.media.medium_view import MediumView
-from mivol.transport.traversal.box import UNIT_CUBE, Box, clip_to_ball, clip_to_box, is_in_box, opaque_numbers
+from mivol.transport.traversal.box import (
+    UNIT_CUBE,
+    Box,
+    clip_to_ball,
+    clip_to_box,
+    clip_to_faces,
+    find_ball,
+    find_faces,
+    is_in_box,
+    opaque_numbers,
+)
 from mivol.transport.traversal.rays import Ray, point_along
 
 __all__ = [
@@ -68,6 +78,9 @@ class Body:
         self.phase = view.phase.prepare()
         self.cuts_grids = cuts_grids(view, box, hole)
         self.rows = box.rows() if box is not None else None
+        # Found here, since a ray is clipped inside of loops.
+        self.faces = find_faces(self.rows) if box is not None and box.is_upright and not box.is_round else None
+        self.ball = find_ball(self.rows) if box is not None and box.is_round else None
         self.hole_rows = hole.rows() if hole is not None else None
         self.edge = mi.Float(opaque_numbers(np.array([box.edge]))[0]) if box is not None else None
         self.exact_parts = [p for p in view.parts if p.exact_line]
@@ -82,8 +95,10 @@ class Body:
 
     def clip(self, ray: Ray, t0: mi.Float64, t1: mi.Float64) -> tuple[mi.Float64, mi.Float64]:
         """The part of the interval [t0, t1] of a ray inside the box or ball [length]; t1 <= t0 if the ray misses it."""
-        if self.box.is_round:
-            return clip_to_ball(self.rows, ray.o, ray.d, t0, t1)
+        if self.ball is not None:
+            return clip_to_ball(*self.ball, ray.o, ray.d, t0, t1)
+        if self.faces is not None:
+            return clip_to_faces(*self.faces, ray.o, ray.d, t0, t1)
         return clip_to_box(self.rows, *UNIT_CUBE, ray.o, ray.d, t0, t1)[2:]
 
     def contains(self, p: mi.Point3f) -> mi.Bool:
