@@ -214,6 +214,18 @@ def test_paths_have_the_mean_of_volpath(place):
 # -- Fireflies -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("variant_rgb")
+@pytest.mark.parametrize("shape", ["cube", "sphere"])
+def test_no_light_comes_from_behind_a_wall(shape):
+    """A lamp in a homogeneous medium, behind a wall through the medium. Flights that end in front know no wall."""
+    bulb = {"type": "point", "position": [0, 0, -0.5], "intensity": 5.0}
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3)}
+    fog = {"type": shape, "bsdf": {"type": "null"}, "interior": medium("homogeneous", 1.0, 0.9)}
+    eye = scenes.camera((0.0, 0.0, 4.0), (0.0, 0.0, 0.0), res=4)
+    scene = mi.load_dict({"type": "scene", "fog": fog, "wall": wall, "bulb": bulb, "sensor": eye})
+    assert not np.array(mi.render(scene, integrator=mi.load_dict(mivol(max_depth=4)), spp=64, seed=1)).any()
+
+
 def test_samples_are_bounded():
     """In a homogeneous box, samples of a segment are at most e^-2 sigma_s I / (2 h) for a lamp at the distance h from the ray.
 

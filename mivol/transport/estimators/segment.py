@@ -66,6 +66,7 @@ class PathSegment:
         emission_weight: weight of the emission of media along the segment, if the origin has sampled their emission too [1];
             None means a weight of 1.
         known: flights found before, for estimators whose segments end in media; None without such flights.
+        needs_surface: whether the surface at the end is needed behind a collision too.
     """
 
     ray: Ray
@@ -77,6 +78,7 @@ class PathSegment:
     is_side_flight: bool = False
     emission_weight: mi.Float | None = None
     known: KnownFlight | None = None
+    needs_surface: bool = False
 
 
 @dataclass

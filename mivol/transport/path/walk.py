@@ -466,6 +466,8 @@ def _follow_segment(estimators: Estimators, path: Path) -> tuple[Path, PathEvent
     samples = estimators.segment.draw(path.sampler, may_scatter)
     # Copies: throughput and depth change in place below, and derivatives read the values at the start of the segment later.
     segment = PathSegment(path.ray, path.medium, mi.Spectrum(path.beta), may_scatter, samples, mi.UInt32(path.depth))
+    # Distances to near emitters are drawn up to the surface, behind the collision of the flight too.
+    segment.needs_surface = estimators.near is not None
     if path.known is not None:
         segment.known, path.known = path.known, path.known.forget()
     if estimators.emission is not None:

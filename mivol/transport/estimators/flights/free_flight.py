@@ -294,7 +294,9 @@ class FreeFlight:
         u, rng = segment.samples
         rng, (pick, at_emission, at_probe, chance) = draw_pcg32(rng, 4)
         channel = _sample_channel(segment.beta, pick) if media.channels > 1 else mi.UInt32(0)
-        end, flight = _find_first_collision(media, ray, segment.medium, u, channel, rng, active, segment.known)
+        end, flight = _find_first_collision(
+            media, ray, segment.medium, u, channel, rng, active, segment.known, stops=not segment.needs_surface
+        )
         collides = active & (flight.t < mi.Float64(end.t))
         t = dr.select(collides, flight.t, mi.Float64(end.t))
         passed = RaySegment.upto(ray, segment.medium, t, flight.passages)
@@ -401,12 +403,14 @@ def _find_first_collision(
     active: mi.Bool,
     known: KnownFlight | None = None,
     inverts: bool = False,
+    stops: bool = True,
 ) -> tuple[SegmentEnd, _Flight]:
     """Follow a ray to the first opaque surface, and find the first collision in front of the surface.
 
     Args:
         known: collisions that are not searched again.
         inverts: optical depths are inverted where possible, instead of drawing tentative collisions.
+        stops: the ray is traced up to the collision only; a surface behind the collision may be missing.
     """
     bodies = media.bodies
 
@@ -445,7 +449,7 @@ def _find_first_collision(
     start = _Flight(dr.full(mi.Float64, dr.inf, width), dr.zeros(mi.UInt32, width), u, rng, start_passages(media, width))
     if known is not None:
         start.t, start.body = dr.select(known.on, known.t, start.t), dr.select(known.on, known.body, start.body)
-    return visit_media(media, ray, medium, visit, start, active, reach=lambda flight: flight.t)
+    return visit_media(media, ray, medium, visit, start, active, reach=(lambda flight: flight.t) if stops else None)
 
 
 def _uses_delta_tracking(part: Extinction) -> bool:
