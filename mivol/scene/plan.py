@@ -61,6 +61,7 @@ from mivol.scene.refusals import (
 )
 from mivol.scene.survey import SceneSurvey
 from mivol.transport.estimators.flights.flight_derivatives import MIN_ALBEDO
+from mivol.transport.estimators.lighting.bright_map import BrightMap
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.lighting.emission_sampling import EmissionSampling, EmissionTable
 from mivol.transport.estimators.lighting.kept_rays import MirroredEmitters
@@ -427,16 +428,17 @@ def build_estimators(
     readings: Readings | None = None,
     tracer: mi.Scene | None = None,
     balls: mi.Float | None = None,
+    bright: BrightMap | None = None,
 ) -> Estimators:
     """Build the planned estimators, for images or for derivatives; ``readings`` and ``tracer`` as for :func:`build_media`,
-    ``balls`` as for :class:`DirectLighting`.
+    ``balls`` and ``bright``, in images, as for :class:`DirectLighting`.
     """
     draws_near_light = plan.draws_near_light if for_images else plan.near_light_in_derivatives
     media = build_media(scene, needs, plan, survey, readings, for_images, tracer)
     if settings.deterministic:
         media = media.by_quadrature()
     # Candidates would lengthen gradients by a tenth.
-    direct = DirectLighting(media, balls, resamples=for_images)
+    direct = DirectLighting(media, balls, resamples=for_images, bright=bright if for_images else None)
     choice = SegmentInputs(direct, plan.scattering_points)
     if plan.segment in ("single_scattering", "scattering_quadrature"):
         with dr.suspend_grad():

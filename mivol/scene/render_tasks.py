@@ -22,6 +22,7 @@ from mivol.scene.plan import Plan, Readings, build_estimators
 from mivol.scene.scene_state import SceneState, find_hidden_arrays
 from mivol.scene.survey import SceneSurvey
 from mivol.space import lattice_from_world
+from mivol.transport.estimators.lighting.bright_map import BrightMap
 from mivol.transport.estimators.lighting.tabulated_shadows import place_nodes
 from mivol.transport.estimators.scores import Primal, Replay, Tangent
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
@@ -56,6 +57,7 @@ class PreparedArrays:
         tracer: scene of the surfaces alone; None to trace the whole scene.
         balls: where emitters are (:func:`mivol.transport.estimators.lighting.emitters.read_balls`); None while ``dr.freeze``
             records.
+        bright: table for samples of the environment map, in images (:class:`BrightMap`).
         phases: the phase function of each medium, whose arrays Mitsuba hides from Dr.Jit.
     """
 
@@ -65,6 +67,7 @@ class PreparedArrays:
     placements: mi.Float64 | None
     tracer: mi.Scene | None
     balls: mi.Float | None
+    bright: BrightMap | None
     phases: list[Phase] = field(default_factory=list)
 
 
@@ -201,7 +204,7 @@ class RenderTask(RecordedTask):
             needs = self.needs.with_views(self.survey, arrays.phases, self.layout.scales)
             if arrays.light is not None:
                 needs = replace(needs, media_light=MediaLight(*arrays.light))
-            made = arrays.readings, arrays.tracer, arrays.balls
+            made = arrays.readings, arrays.tracer, arrays.balls, arrays.bright
             return build_estimators(scene, needs, self.plan, self.settings, self.survey, self.for_images, *made)
 
     def samples(self, sensor: mi.Sensor, arrays: PreparedArrays, seed: mi.UInt32) -> RenderSamples:

@@ -53,6 +53,7 @@ from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.stand_in import StandIn, evaluate_samplers, reset_sampler
 from mivol.scene.survey import SceneSurvey, survey_scene
 from mivol.scene_graph import list_values, put_value, traverse, traverse_children
+from mivol.transport.estimators.lighting.bright_map import BrightMap, MapReading
 from mivol.transport.estimators.lighting.emitters import read_balls
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.line_integrals.aovs import integrate_aovs
@@ -77,6 +78,7 @@ class _SurveyedScene:
         opened: the plans for images (True) and for derivatives (False).
         stand_ins: sensors with their stand-ins, by pointer and facts. With the sensor: another one could get its pointer.
         views: of the last image, for its derivatives; kept longer, they would keep the derivatives of an earlier step.
+        map: the bright part of the environment map.
         number: tells the recordings of scenes apart.
     """
 
@@ -87,6 +89,7 @@ class _SurveyedScene:
     opened: dict[bool, PlannedScene] = field(default_factory=dict)
     stand_ins: dict[tuple, tuple[mi.Sensor, StandIn | None]] = field(default_factory=dict)
     views: tuple[MediumView, ...] = ()
+    map: MapReading = field(default_factory=MapReading)
     number: int = field(default_factory=itertools.count().__next__)
 
     def derives_from(self, scene: mi.Scene, differentiated: Sequence[tuple[str, mi.Object]]) -> bool:
@@ -361,7 +364,8 @@ class Session:
         if is_placed_anew:
             placements, layout = prepare_placements(viewed, survey.size, known.plan.shadow_nodes)
             arrays = replace(arrays, placements=placements, tracer=survey.usable_tracer)
-        arrays = replace(arrays, readings=read_parts(viewed, known.plan, survey, for_images))
+        readings, bright = read_parts(viewed, known.plan, survey, for_images), self._read_bright_map(scene, for_images)
+        arrays = replace(arrays, readings=readings, bright=bright)
         self._surveyed.views = views if for_images else ()
         return replace(known, state=state, survey=survey, needs=needs, arrays=arrays, layout=layout)
 
@@ -386,11 +390,19 @@ class Session:
         else:
             placements, layout = prepare_placements(needs, survey.size, plan.shadow_nodes)
         readings, balls = read_parts(needs, plan, survey, for_images), None if is_recording() else read_balls(scene)
-        arrays = PreparedArrays(readings, light, find_batch_views(sensor), placements, survey.usable_tracer, balls)
+        bright = self._read_bright_map(scene, for_images)
+        arrays = PreparedArrays(readings, light, find_batch_views(sensor), placements, survey.usable_tracer, balls, bright)
         self._surveyed.views = needs.views if for_images and not is_recording() else ()
         facts = replace(needs, views=(), media_light=None)
         opened = PlannedScene(state, spp, survey, facts, plan, arrays, settings, layout)
         return self._find_unrecorded(opened, scene, for_images)
+
+    def _read_bright_map(self, scene: mi.Scene, for_images: bool) -> BrightMap | None:
+        """Read the bright part of an environment map for images; returns None for derivatives."""
+        if not for_images or is_recording():
+            return None
+        self._surveyed.map = self._surveyed.map.follow(scene)
+        return self._surveyed.map.table
 
     def _open_like_image(
         self, scene: mi.Scene, sensor: mi.Sensor, spp: int, state: SceneState, views: tuple[MediumView, ...]
@@ -403,9 +415,10 @@ class Session:
         image, known = self._opened.get(True), self._opened.get(False)
         if image is None or image.spp != spp or not image.state.has_same_numbers(state):
             return None
+        arrays = replace(image.arrays, bright=None)
         if known is not None and known.image_plan is image.plan and known.is_like(state, spp):
             needs = known.needs.follow_shapes(image.needs.boundaries, image.needs)
-            return replace(known, state=state, survey=image.survey, needs=needs, arrays=image.arrays, layout=image.layout)
+            return replace(known, state=state, survey=image.survey, needs=needs, arrays=arrays, layout=image.layout)
         needs = image.needs.with_parameters(state.differentiated)
         if needs is None:
             return None
@@ -413,7 +426,7 @@ class Session:
         plan = make_plan(replace(needs, views=views), settings, self.aovs)
         if plan.readings(for_images=False) != image.plan.readings(for_images=True):
             return None
-        made = image.survey, needs, plan, image.arrays, settings, image.layout
+        made = image.survey, needs, plan, arrays, settings, image.layout
         opened = PlannedScene(state, spp, *made, image_plan=image.plan)
         return self._find_unrecorded(opened, scene, for_images=False)
 

@@ -501,7 +501,8 @@ def _add_emitted_light(estimators: Estimators, path: Path, event: PathEvent) -> 
     if estimators.lights_surfaces or estimators.lights_media:
         direct = mi.DirectionSample3f(scene, si, path.last)
         pdf_emitter = _emitter_pdf(estimators, path, direct, ~path.delta & (emitter != None))
-        w_mis = dr.select(path.delta, 1, power_heuristic(path.pdf, pdf_emitter))
+        is_balanced = estimators.direct.emitters.are_balanced(emitter)
+        w_mis = dr.select(path.delta, 1, power_heuristic(path.pdf, pdf_emitter, is_balanced))
     with dr.resume_grad(when=path.score.purpose != IMAGE):
         Le = path.beta * w_mis * emitter.eval(si, visible)
     path.score = path.score.add(TrackedTerm(Le, visible))

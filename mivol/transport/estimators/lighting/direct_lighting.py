@@ -24,6 +24,7 @@ from functools import cached_property
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.estimators.lighting.bright_map import BrightMap
 from mivol.transport.estimators.lighting.emitters import (
     ChosenEmitter,
     EmitterDraw,
@@ -45,10 +46,14 @@ from mivol.transport.traversal.rays import FineRay
 __all__ = ["DirectLight", "DirectLighting", "DirectSample", "DistantEmitterSample", "EmitterSample", "power_heuristic"]
 
 
-def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
-    """Weight of a sample drawn with density ``a`` by one technique and density ``b`` by another (Veach 1997, Eq. 9.13) [1]."""
+def power_heuristic(a: mi.Float, b: mi.Float, is_balanced: mi.Bool | bool = False) -> mi.Float:
+    """Weight of a sample drawn with density ``a`` by one technique and density ``b`` by another (Veach 1997, Eq. 9.13) [1].
+
+    ``is_balanced``: lanes with the exponent 1 in place of 2, the balance heuristic (Eq. 9.8).
+    """
     # As a function of b / a, since a^2 overflows float32 for a > 1.8e19.
-    return dr.select(a > 0, dr.rcp(1 + dr.square(b / a)), 0)
+    ratio = b / a
+    return dr.select(a > 0, dr.rcp(1 + dr.select(is_balanced, ratio, dr.square(ratio))), 0)
 
 
 # -- Samples -------------------------------------------------------------------------------------------------------------
@@ -170,6 +175,7 @@ class DirectLighting:
         media: media and surfaces of the scene.
         balls: numbers of :func:`mivol.transport.estimators.lighting.emitters.read_balls`; by default read from the scene.
         resamples: whether samples of lamps with hidden sides are drawn from candidates.
+        bright: as of :class:`SceneEmitters`.
 
     Attributes:
         shadow_table: table of the shadows of vertices in media, in images; None for shadow rays.
@@ -177,8 +183,11 @@ class DirectLighting:
 
     shadow_table: TransmittanceGrid | None
 
-    def __init__(self, media: SceneMedia, balls: mi.Float | None = None, resamples: bool = True) -> None:
-        self.media, self.shadow_table, self._balls, self._resamples = media, None, balls, resamples
+    def __init__(
+        self, media: SceneMedia, balls: mi.Float | None = None, resamples: bool = True, bright: BrightMap | None = None
+    ) -> None:
+        self.media, self.shadow_table, self._balls = media, None, balls
+        self._resamples, self._bright = resamples, bright
 
     @cached_property
     def emitters(self) -> SceneEmitters:
@@ -204,7 +213,7 @@ class DirectLighting:
             return self._find_emitters(distance)
 
     def _find_emitters(self, distance: str) -> SceneEmitters:
-        made = self._balls, self.media.lit_box, self._resamples
+        made = self._balls, self.media.lit_box, self._resamples, self._bright
         return SceneEmitters(self.media.scene, self.media.start is not None, distance, *made)
 
     def sample_emitter(
@@ -249,7 +258,8 @@ class DirectLighting:
         w_mis = mi.Float(1)
         if sample.has_alternative is not False:
             own = direct.pdf if sample.density is None else sample.density
-            w_mis = dr.select(direct.delta | ~mi.Bool(sample.has_alternative), 1, power_heuristic(own, pdf))
+            weight = power_heuristic(own, pdf, self.emitters.are_balanced(sample.emitter))
+            w_mis = dr.select(direct.delta | ~mi.Bool(sample.has_alternative), 1, weight)
         factor, source = light * w_mis, sample.weight
         with dr.resume_grad(when=attached):
             if attached:
@@ -330,7 +340,8 @@ class DirectLighting:
         w_mis = mi.Float(1)
         if emitters.sampled:
             direct = mi.DirectionSample3f(self.media.scene, si, mei)
-            w_mis = power_heuristic(pdf, emitters.weigh_density(chosen.distribution, mei, direct, on))
+            own = emitters.weigh_density(chosen.distribution, mei, direct, on)
+            w_mis = power_heuristic(pdf, own, emitters.are_balanced(emitter))
         factor = light * w_mis
         with dr.resume_grad(when=attached):
             if attached:
