@@ -47,9 +47,15 @@ def leaves_along(tree: Octree, d: np.ndarray, slope: bool = False) -> LeafColour
     return LeafColours(mi.Float(np.float32(table.ravel())), first, dr.zeros(mi.Float, table.size) if slope else None)
 
 
-@pytest.mark.parametrize("depth, split", [(1, 0.5), (5, 0.55), (8, 0.3), (9, 0.3), (12, 0.2)])
-@pytest.mark.parametrize("colours", ["clamp", "sigmoid"])
+@pytest.mark.parametrize(
+    "depth, split, colours",
+    [
+        *((1, 0.5, "clamp"), (5, 0.55, "clamp"), (8, 0.3, "clamp"), (9, 0.3, "clamp"), (12, 0.2, "clamp")),
+        *((1, 0.5, "sigmoid"), (5, 0.55, "sigmoid")),
+    ],
+)
 def test_agrees_with_the_twin(variant_rgb: str, depth: int, split: float, colours: str) -> None:
+    """The index of leaves depends on the depth, and colours do not."""
     tree, (o, d) = random_octree(depth, split=split, colours=colours), hard_rays()
     rays = bundle(o, d)
     rendered = render_leaves(LeafIndex.find(tree), leaves_along(tree, d), rays, distances=True)

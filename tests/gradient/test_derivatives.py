@@ -195,9 +195,9 @@ def test_branches_keep_the_mean(name: str, key: str, depth: int, monkeypatch: py
     scene, integrator = SCENES[name](), mi.load_dict(mivol(max_depth=depth, rr_depth=3))
     v = upper_half(scene, KEYS[key])
     monkeypatch.setattr(derivatives, "BALANCE", 1e3)
-    found = along(scene, KEYS[key], v, integrator, 512)
+    found = along(scene, KEYS[key], v, integrator, 64)
     monkeypatch.setattr(plan, "choose_branches", lambda *_: (False, []))
-    whole = along(scene, KEYS[key], v, integrator, 1024)
+    whole = along(scene, KEYS[key], v, integrator, 128)
     assert_same_mean(found, whole, rounding=1e-4 * np.abs(whole.mean), what="derivative")
     assert_precise(difference(found, whole), 0.1 * np.abs(whole.mean), what="derivative")
 

@@ -297,10 +297,12 @@ def test_sky_starts_from_the_median_colour(variant_rgb: str, photos: list[Photo]
 
 
 def test_beta_favours_opacities_of_0_or_1(variant_rgb: str, photos: list[Photo]) -> None:
-    """The beta prior's part of the derivatives is that of the mean of log T + log(1 - T) over the rays."""
+    """The beta prior's part of the derivatives is that of the mean of log T + log(1 - T) over the rays that count."""
     batches, parts = RayBatches.from_photos(photos[:3], (1, 2)), {}
     problem = RadianceProblem(batches, BOX, replace(PLAN, start=1.0))  # a fog: no density is at the ReLU's kink
     batch = draw_tiles(batches, 2, np.arange(3), 30, np.random.default_rng(3))
+    counted = np.arange(dr.width(batch.slot)) % 3 > 0
+    batch.counted = mi.Float(counted)
     for beta in (0.0, 0.5):
         problem.plan = replace(PLAN, beta=beta)
         parts[beta] = np.array(problem.batch_loss_and_gradient(batch, np.ones(3))[1]["density"], np.float64)
@@ -312,7 +314,7 @@ def test_beta_favours_opacities_of_0_or_1(variant_rgb: str, photos: list[Photo])
         seen = render_rays(cells, bake(field, cells, batch.origins, batch.slot), make_model(field, PLAN.stop), batch.rays)
         T = np.array(seen.T, np.float64)
         near = np.clip(T, 0.01, 0.99)  # beyond, the prior goes on as its tangent
-        return float(np.mean(np.log(near) + np.log(1 - near) + (1 / near - 1 / (1 - near)) * (T - near)))
+        return float(np.mean(counted * (np.log(near) + np.log(1 - near) + (1 / near - 1 / (1 - near)) * (T - near))))
 
     v, h = np.array(problem.field.density, np.float64), 1e-3
     expected = 0.5 * (prior(v + h * way) - prior(v - h * way)) / (2 * h)
