@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -90,6 +91,15 @@ def replays(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, np.ndarray, np.n
     monkeypatch.setattr(derivatives, "BALANCE", 1e3)  # as many branches as there are lanes for
     # A recorded loop would hide the values.
     monkeypatch.setattr(derivatives, "replay_in_one_kernel", lambda width, walk: [walk(mi.Bool(k == 0)) for k in range(2)])
+    add = derivatives._ProbeList.add
+
+    def add_now(*given: Any) -> None:
+        # Outside of a loop, a counter and all that it places must be in one kernel.
+        dr.eval()
+        add(*given)
+        dr.eval()
+
+    monkeypatch.setattr(derivatives._ProbeList, "add", add_now)
 
     def watched_walk(estimators: Estimators, start: PathStart, score: Replay, stops: mi.Bool, probes: tuple[str, ...]) -> Path:
         path = walk_part(estimators, start, score, stops, probes)
@@ -124,6 +134,31 @@ def test_light_is_linear_in_the_sun(depth: int, replays: list) -> None:
     found = bright * np.sum(gradient_of_mean_image(scene, KEYS["sun"], 16, fresh(3), depth))
     _, light, _, dL = replays[0]
     assert found == pytest.approx(np.sum(light * dL), rel=1e-4)
+
+
+@pytest.mark.parametrize("name", cases(SCENES, slow=("rgb", "fire", "glass")))
+def test_listed_probes_add_what_probes_add_in_their_lanes(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same probes with the same random numbers: the same terms in another order."""
+    found = []
+    for fewest in (1, 1 << 30):
+        monkeypatch.setattr(derivatives, "MIN_LISTED", fewest)
+        found.append(gradient_of_mean_image(SCENES[name](), KEYS["density"], 64, fresh(3)))
+    # A voxel has at most 4096 float32 terms of both signs.
+    np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-5 * np.abs(found[1]).max())
+
+
+@pytest.mark.parametrize(("density", "share"), [(0.0, 1.0), (8.0, 4 * 0.3 / 8.3)])
+def test_dense_media_keep_few_probes(density: float, share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a box with an edge of 2, kappa is 0.3, and a probe survives with the probability min(1, 4 kappa / (sigma + kappa))."""
+    lists, add = [], derivatives._ProbeList.add_derivatives
+    monkeypatch.setattr(derivatives, "MIN_LISTED", 1)
+    monkeypatch.setattr(derivatives._ProbeList, "add_derivatives", lambda *given: (lists.append(given[0]), add(*given)))
+    interior = medium("mivol_medium", grid_volume("mivol_voxels", np.full((4, 5, 6, 1), density), PLACE), 0.8)
+    scene = close_up({"smoke": box_of(interior, PLACE), "lit": sky(1.0)}, res=8, fov=8.0)
+    gradient_of_mean_image(scene, KEYS["density"], 2048, fresh(3))
+    first, rays = int(lists[0].counts[0][0]), 64 * 2048
+    # Every ray meets the box, and has a first probe. A binomial count is off by 6 standard deviations with a chance of 2e-9.
+    assert abs(first - share * rays) <= 6 * np.sqrt(rays * share * (1 - share))
 
 
 def test_branches_of_a_stem_differ(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ k = sqrt(B a / (A b)), and b is proportional to the share of stems with a collis
 Only the device knows the number of branches, so that derivatives can be recorded and replayed. Branches have as many lanes as
 stems, of which the last are off.
 
-Bias: none. Memory: about 80 numbers a stem.
+Bias: none. Memory: about 80 numbers a stem, 120 with probes (160 with surfaces).
 
 References: Arvo & Kirk 1990 (splitting); Vicini et al. 2021 (path replay).
 """
@@ -28,13 +28,17 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.estimators.flights.baseline import Baseline, BaselineSums
+from mivol.transport.estimators.flights.flight_derivatives import Probe, ProbeTerm
 from mivol.transport.estimators.scores import Factor, Replay, Rest, Tangent
-from mivol.transport.estimators.segment import SegmentTransmittance
+from mivol.transport.estimators.segment import KnownFlight, SegmentTransmittance
+from mivol.transport.media.body import medium_interaction
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays
+from mivol.transport.path.successive import walk_from_points
 from mivol.transport.path.walk import (
     Path,
     PathStart,
+    add_probes,
     leave_camera_from_memory,
     walk_from_camera,
     walk_in_kernel,
@@ -42,6 +46,7 @@ from mivol.transport.path.walk import (
     walk_part,
 )
 from mivol.transport.traversal.random_numbers import SpreadSampler
+from mivol.transport.traversal.rays import FineRay, point_along
 
 __all__ = ["carry_tangents", "count_branches", "prepare_derivatives", "replay_branches"]
 
@@ -61,6 +66,10 @@ segment, and each branch costs more. (Best k of scenes with lamps inside: 1.6 to
 
 USUAL_NOISE = 0.15
 """The noise of media without a baseline."""
+
+MIN_LISTED = 1 << 14
+"""Smallest number of rays in a pass whose probes are listed, and walk in a kernel of their own. In smaller passes a path walks
+on from its own probes, since fewer kernels matter more there."""
 
 MAX_SORTED_LENGTH = 0xFFF
 """Largest number of scattering events told apart when branches are sorted by length."""
@@ -119,12 +128,22 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
     stem, branches = branching.gather(order)
     branch_score = Replay(dr.gather(mi.Spectrum, L, order), dr.gather(mi.Spectrum, dL, stem) * branching.share)
     stem_score = Replay(branching.add_light(stem_light, L), dL)
+    listed = None
+    if n >= MIN_LISTED and any(body.needs_probes for body in estimators.media.bodies):
+        listed = _ProbeList.empty(n, estimators.media.has_surfaces)
 
     def replay(is_stem: mi.Bool) -> None:
         begun, score = dr.select(is_stem, (start.clone(), stem_score), (branches.clone(), branch_score))
-        walk_part(estimators, begun, score, is_stem, ("first", "later"))
+        path = walk_part(estimators, begun, score, is_stem, ("first", "later"))
+        if listed is None:
+            add_probes(estimators, path)
+            return
+        for probe, is_later in ((path.probes.first, False), (path.probes.later, True)):
+            listed.add(probe, path.sampler, score.dL, is_later)
 
     replay_in_one_kernel(n, replay)
+    if listed is not None:
+        listed.add_derivatives(estimators, start.ray.wavelengths)
 
 
 def carry_tangents(estimators: Estimators, rays: CameraRays) -> mi.Spectrum:
@@ -258,6 +277,76 @@ class _Lengths:
         order = dr.empty(mi.UInt32, n)
         dr.scatter(order, dr.arange(mi.UInt32, n), dr.gather(mi.UInt32, start, self.key) + self.place)
         return order
+
+
+# -- Probes --------------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class _ProbeList:
+    """The probes of replayed paths, in memory.
+
+    Few probes are left in dense media (:meth:`.Probe.thin`). Their paths walk in a kernel of their own, where no lane waits for
+    another one.
+
+    Attributes:
+        p: the points.
+        d: directions of their flights.
+        time: times of their rays.
+        body: indices of their media.
+        gain: d loss / d light of each path, times the gain of its probe [length].
+        depth: number of scattering events before the probe.
+        bits, state: random numbers (:class:`SpreadSampler`).
+        counts: number of probes of first flights, at the beginning of the arrays, and of later flights, at their end (arrays of
+            one number).
+    """
+
+    p: mi.Point3d
+    d: mi.Vector3f
+    time: mi.Float
+    body: mi.UInt32
+    gain: mi.Spectrum
+    depth: mi.UInt32
+    bits: mi.UInt32
+    state: mi.UInt32
+    counts: list[mi.UInt32]
+
+    @classmethod
+    def empty(cls, stems: int, has_surfaces: bool) -> _ProbeList:
+        """A list with room for the probes of stems and branches, as many branches as stems."""
+        # Only a stem that has scattered at a surface has a later probe too.
+        n = stems * (3 if has_surfaces else 2)
+        kinds = mi.Point3d, mi.Vector3f, mi.Float, mi.UInt32, mi.Spectrum, mi.UInt32, mi.UInt32, mi.UInt32
+        made = cls(*(dr.empty(kind, n) for kind in kinds), [dr.opaque(mi.UInt32, 0) for _ in range(2)])
+        dr.eval(made)
+        return made
+
+    def add(self, probe: Probe, sampler: SpreadSampler, dL: mi.Spectrum, is_later: bool) -> None:
+        """Add the first or the later probes of paths at their ends, with their random numbers and d loss / d light."""
+        gain, on = dL * probe.gain, probe.weight > 0
+        place = dr.scatter_inc(self.counts[is_later], dr.zeros(mi.UInt32, dr.width(on)), on)
+        place = dr.width(self.body) - 1 - place if is_later else place
+        own = sampler.branch(mi.UInt32(is_later), mi.UInt32(2))
+        values = point_along(probe.ray, probe.t), probe.ray.d, probe.ray.time, probe.body, gain, probe.depth
+        stored = self.p, self.d, self.time, self.body, self.gain, self.depth, self.bits, self.state
+        for array, value in zip(stored, (*values, own.bits, own.state), strict=True):
+            dr.scatter(array, value, place, on)
+
+    def add_derivatives(self, estimators: Estimators, wavelengths: mi.Color0f) -> None:
+        """Walk paths from the probes, and add the derivatives at them."""
+        media, n = estimators.media, dr.width(self.body)
+        dr.eval(self)
+        lane, (front, back) = dr.arange(mi.UInt32, n), self.counts
+        on, every, zero = (lane < front) | (lane >= n - back), mi.Bool(True), dr.zeros(mi.Float64, n)
+        ray = FineRay(self.p, self.d, dr.full(mi.Float, dr.inf, n), self.time, wavelengths)
+        sampler = SpreadSampler(self.bits, self.state, dr.full(mi.Float, -1, n))
+        nowhere, one, flight = dr.zeros(mi.MediumPtr, n), (mi.Spectrum(1), mi.Float(1)), KnownFlight(zero, self.body, every)
+        start = PathStart(ray, nowhere, *one, self.depth, sampler, every, flight, every)
+        L = walk_from_points(estimators.replayed(), start, front, back)
+        probe = Probe(ray, zero, self.body, self.gain, self.depth, dr.ones(mi.Float, n), dr.ones(mi.Float, n))
+        mei = medium_interaction(ray, zero)
+        mei.medium = media.medium_of(self.body, on)
+        ProbeTerm(media, probe, mei, L, estimators.segment.baseline, on).vjp(mi.Spectrum(1))
 
 
 # -- The baseline --------------------------------------------------------------------------------------------------------

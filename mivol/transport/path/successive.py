@@ -34,11 +34,12 @@ from mivol.transport.path.walk import (
     begin_path,
     film_alpha,
     leave_camera,
+    start_path,
     walk_light,
 )
 from mivol.transport.traversal.random_numbers import SpreadSampler
 
-__all__ = ["paths_per_lane", "walk_branching", "walk_successively"]
+__all__ = ["paths_per_lane", "walk_branching", "walk_from_points", "walk_successively"]
 
 
 MIN_LANES = {"llvm": 1 << 13, "cuda": 1 << 20, "metal": 1 << 20}
@@ -47,6 +48,9 @@ a GPU holds about 2^18 lanes. The number of threads does not enter, so a seed gi
 
 BRANCHED_PATHS = 16
 """Paths for each lane, of those that may branch."""
+
+PATHS_FROM_POINTS = 16
+"""Starts of paths for each lane in :func:`walk_from_points`, left out or not."""
 
 
 def paths_per_lane(limit: int, paths: int) -> int:
@@ -124,6 +128,50 @@ def walk_successively(
         # Here every lane has one ray, and none waits for the longer path of another.
         L += rays.light_at_camera(estimators.media, starts.ray)
     return L, alpha
+
+
+def walk_from_points(estimators: Estimators, starts: PathStart, front: mi.UInt32, back: mi.UInt32) -> mi.Spectrum:
+    """Walk paths that begin by scattering at points of media, several in succession in each lane.
+
+    Args:
+        estimators: estimators of the render; their segments end in media.
+        starts: starts at collisions, in memory, with a throughput of 1.
+        front, back: number of starts at the beginning of the arrays and at their end (arrays of one number); those between are
+            left out.
+
+    Returns:
+        The radiance scattered at each point, over the albedo there; undefined for starts that are left out.
+
+    Bias, variance: as for :func:`mivol.transport.path.walk.walk_path`.
+    """
+    n = dr.width(starts.depth)
+    lanes, paths = -(-n // paths_per_lane(PATHS_FROM_POINTS, n)), _WorkList(front + back, dr.opaque(mi.UInt32, 0))
+    L = dr.empty(mi.Spectrum, n)
+    dr.eval(starts, L)
+
+    def start(index: mi.UInt32, active: mi.Bool) -> tuple[Path, KnownFlight]:
+        at = starts.gather(index, active)
+        path = start_path(estimators, at.ray, Primal(dr.zeros(mi.Spectrum, lanes)), at.sampler, active)
+        path.depth = at.depth
+        return path, at.flight
+
+    def advance(path: Path, begun: KnownFlight, index: mi.UInt32, on: mi.Bool) -> tuple:
+        hit = make_collision(estimators.media, path.ray, begun.t, begun.body, path.active & begun.on)
+        hit.albedo = dr.full(mi.Spectrum, 1, lanes)
+        path, begun = advance_path(estimators, path, hit), begun.forget()
+        asks = on & ~path.active
+        dr.scatter(L, path.score.L, index, asks & (index != NONE_YET))
+        number, begins = paths.take(asks)
+        index = dr.select(asks, dr.select(number < front, number, number + (n - front - back)), index)
+        fresh, at_point = start(index, begins)
+        return dr.select(asks, fresh, path), dr.select(asks, at_point, begun), index, path.active | begins
+
+    # No lane has begun: the first turn of the loop gives each its first path, until the list is empty.
+    index, on = dr.full(mi.UInt32, NONE_YET, lanes), dr.full(mi.Bool, True, lanes)
+    state = (*start(index, ~on), index, on)
+    dr.while_loop(state=state, cond=lambda *state: state[-1], body=advance, label="paths from points")
+    dr.eval(L)
+    return L
 
 
 def walk_branching(

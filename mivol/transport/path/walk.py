@@ -55,6 +55,7 @@ from mivol.transport.traversal.rays import FineRay, Ray, clip_camera_ray, point_
 __all__ = [
     "Path",
     "PathStart",
+    "add_probes",
     "advance_path",
     "begin_path",
     "film_alpha",
@@ -343,7 +344,7 @@ def walk_from_camera(estimators: Estimators, start: PathStart, score: Score) -> 
         path.is_opaque |= event.at_surface
         return path.score, film_alpha(path)
     path = begin_path(estimators, start, score, "first", "later")
-    path = _add_reservoirs(estimators, _walk_to_end(estimators, path))
+    path = add_probes(estimators, _end_path(estimators, _walk_to_end(estimators, path)))
     return path.score, film_alpha(path)
 
 
@@ -360,12 +361,12 @@ def walk_part(
         probes: as of :func:`_start_reservoirs`.
 
     Returns:
-        The paths at their ends.
+        The paths at their ends, with thinned probes, whose derivatives are not yet added.
     """
     path = begin_path(estimators, start, score, *probes)
     flight = start.flight
     at = make_collision(estimators.media, path.ray, flight.t, flight.body, flight.on & start.at_collision)
-    return _add_reservoirs(estimators, _walk_from_collision(estimators, path, at, stops))
+    return _end_path(estimators, _walk_from_collision(estimators, path, at, stops))
 
 
 def walk_light(
@@ -401,7 +402,7 @@ def walk_in_kernel(
     stem = dr.opaque(mi.Bool, stops)
     if shares:
         begin_kernel(start, stem)
-    path = walk_part(estimators, start, score, stem, probes)
+    path = add_probes(estimators, walk_part(estimators, start, score, stem, probes))
     alpha = dr.select(path.known.on, 1, film_alpha(path))
     if shares:
         begin_kernel(path.score, alpha, (path.ray, path.medium, path.beta, path.eta, path.depth, path.known))
@@ -764,20 +765,26 @@ def _start_reservoirs(estimators: Estimators, path: Path, *probes: str) -> Path:
     return path
 
 
-def _add_reservoirs(estimators: Estimators, path: Path) -> Path:
-    """Add the derivatives at the kept points and along the kept shadow ray, and its light in images, at the end of a path."""
+def _end_path(estimators: Estimators, path: Path) -> Path:
+    """Add the derivatives along the kept shadow ray, and its light in images, at the end of a path; thin its probes."""
     for kept in (path.tabulated, path.mirror):
         if kept is not None:
             path.score = path.score.add(TrackedTerm(kept.light_at_camera(estimators.media, path.ray), mi.Bool(True)))
     if path.shadow is not None:
         path.score = path.score.add(ShadowTerm(estimators.media, path.shadow))
     if path.probes is not None:
-        path = _add_probes(estimators, path)
+        first, later = (
+            None if probe is None else probe.thin(estimators.media, path.sampler.next_1d())
+            for probe in (path.probes.first, path.probes.later)
+        )
+        path.probes = Probes(first, later)
     return path
 
 
-def _add_probes(estimators: Estimators, path: Path) -> Path:
+def add_probes(estimators: Estimators, path: Path) -> Path:
     """Add the derivatives at the kept points."""
+    if path.probes is None:
+        return path
     first, later = path.probes.first, path.probes.later
     if first is None or later is None:
         path.score = path.score.add(_estimate_probe(estimators, first or later, path.sampler))
@@ -785,7 +792,8 @@ def _add_probes(estimators: Estimators, path: Path) -> Path:
 
     def turn(number: mi.UInt32, score: Score, sampler: mi.Sampler | SpreadSampler) -> tuple:
         probe = dr.select(number == 0, first, later)
-        return number + 1, score.add(_estimate_probe(estimators, probe, sampler)), sampler
+        own = sampler.branch(number, mi.UInt32(2)) if isinstance(sampler, SpreadSampler) else sampler
+        return number + 1, score.add(_estimate_probe(estimators, probe, own)), sampler
 
     state = dr.zeros(mi.UInt32, dr.width(first.t)), path.score, path.sampler
     _, path.score, path.sampler = dr.while_loop(state=state, cond=lambda number, *_: number < 2, body=turn, label="probes")

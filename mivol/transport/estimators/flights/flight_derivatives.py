@@ -30,7 +30,7 @@ References: Vicini et al. 2021 (path replay); Nimier-David et al. 2022 (probes i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import drjit as dr
@@ -40,7 +40,7 @@ from mivol.transport.estimators.flights.baseline import Baseline, BaselineSums
 from mivol.transport.estimators.flights.gaussian_light import GaussianLight
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight
 from mivol.transport.estimators.segment import Collision, FlightPoint, PathSegment
-from mivol.transport.media.body import Body, emission_slope, eval_albedo, eval_emission
+from mivol.transport.media.body import Body, emission_slope, eval_albedo, eval_emission, medium_interaction
 from mivol.transport.media.extinction import Weight, colours_to_channels, take_tangent, to_spectrum
 from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth, vjp_rows
 from mivol.transport.media.ray_intervals import RaySegment, start_passages
@@ -60,6 +60,11 @@ __all__ = [
 
 PROBE_TAU = 0.6
 """Optical depth of the extinction kappa across a medium [1] (measured in a box: 0.3 per half edge)."""
+
+SURVIVAL = 4.0
+"""The number c in the probability min(1, c kappa / (sigma + kappa)) with which a path keeps a probe at its end. In dense places
+collisions carry the derivative. Where probes are left out, their variance is at most kappa l / (c - 1) of the variance of
+collisions, with the length l of the flight."""
 
 MIN_ALBEDO = 0.1
 """Albedo below which probes estimate the derivatives by the albedo [1]; above, L / albedo is at most 10 L."""
@@ -295,6 +300,26 @@ class Probe:
             dr.select(keep, weight, self.weight),
             total,
         )
+
+    def thin(self, media: SceneMedia, chance: mi.Float) -> Probe:
+        """Keep the probe if ``chance``, uniform in [0, 1), is below its survival probability (:data:`SURVIVAL`).
+
+        A kept probe has the gain of the whole reservoir, over this probability, and a weight of 1.
+        """
+        survival, found = mi.Float(0), self.weight > 0
+        mei = medium_interaction(self.ray, dr.select(found, self.t, 0))
+        mei.medium = media.medium_of(self.body, found)
+        for body, on in media.bodies_at(self.body, found):
+            weight = dr.max(_collision_weight(media, body, self.ray, self.t, on)[1])
+            share = dr.minimum(SURVIVAL * _probe_extinction(media, body) * weight, 1)
+            if body.view.albedo is not None:
+                # Such a probe has all of the derivative by the albedo, however dense the medium is.
+                share = dr.select(dr.min(dr.detach(eval_albedo(body, mei, on))) < MIN_ALBEDO, 1, share)
+            survival = dr.select(on, share, survival)
+        kept = chance < survival
+        gain = self.gain * (self.total / dr.select(kept, self.weight * survival, 1))
+        weight = dr.select(kept, mi.Float(1), 0)
+        return replace(self, gain=gain, weight=weight, total=weight)
 
 
 @dataclass
