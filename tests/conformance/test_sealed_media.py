@@ -87,21 +87,26 @@ def test_a_traced_boundary_without_glass_is_passed() -> None:
     assert not survey_scene(mi.load_dict({"type": "scene", "can": can, "sky": scenes.sky()})).facts.stops_rays
 
 
+BULB = {"bulb": {"type": "point", "position": [0.3, 0.2, 0.1], "intensity": 3.0}}
+AMONG = {"tank": tank(GLASS), "spoon": ball(-0.5), "table": ball(-2.5, 1.3)}
 SOLID = {
-    "stops_rays": {"tank": tank(GLASS), "spoon": ball(-0.5)},
-    "has_solid_surfaces": {"tank": tank(NONE), "spoon": ball(-0.5), "table": ball(-2.5, 1.3)},
+    "a grid in glass": ("stops_rays", {"tank": tank(GLASS), "spoon": ball(-0.5), **BULB}, "data"),
+    "a grid in glass among surfaces": ("has_solid_surfaces", AMONG | BULB, "data"),
+    "a lamp in a homogeneous medium": ("has_solid_surfaces", AMONG | BULB, "value.value"),
+    "a homogeneous medium": ("has_solid_surfaces", AMONG | {"sky": scenes.sky(), "lamp": lamp(2.0)}, "value.value"),
+    "a box": ("has_solid_surfaces", AMONG | BULB | {"tank": tank(NONE)}, "data"),
 }
-"""By what tells that rays end at surfaces, scenes in which they do."""
+"""What tells that rays end at surfaces, scenes in which they do, and the end of the name of the extinction."""
 
 
-@pytest.mark.parametrize("fact", SOLID)
-def test_what_is_not_traced_again_is_the_same(fact: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A lamp in a tank with a grid, images and derivatives: to the rounding of the length of a segment."""
-    smoke = scenes.grid_volume("mivol_voxels", rough_grid(1, 3.0), PLACE)
-    parts = SOLID[fact] | {"bulb": {"type": "point", "position": [0.3, 0.2, 0.1], "intensity": 3.0}}
-    parts["tank"] |= {"interior": {"type": "mivol_medium", "sigma_t": smoke, "albedo": 0.8}}
+@pytest.mark.parametrize("name", SOLID)
+def test_what_is_not_traced_again_is_the_same(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images and derivatives of a tank: to the rounding of the length of a segment."""
+    fact, shapes, end = SOLID[name]
+    smoke = scenes.grid_volume("mivol_voxels", rough_grid(1, 3.0), PLACE) if end == "data" else 1.5
+    parts = shapes | {"tank": shapes["tank"] | {"interior": {"type": "mivol_medium", "sigma_t": smoke, "albedo": 0.8}}}
     eye = scenes.camera((2.0, 1.5, 6.0), (0.0, 0.0, 0.0), res=6)
-    key, found, seen = "tank.interior_medium.sigma_t.data", [], []
+    key, found, seen = f"tank.interior_medium.sigma_t.{end}", [], []
     known = SceneMedia.__init__
     monkeypatch.setattr(SceneMedia, "__init__", lambda self, *a, **k: known(self, *a, **k) or seen.append(getattr(self, fact)))
     for again in (False, True):

@@ -161,7 +161,8 @@ def visit_media(
 
     Media behind traced boundaries are visited in the order of the ray. Media in boxes are visited in no order: before the
     tracing, if all media are homogeneous, since ``reach`` then shortens the traced ray at no cost; and after it, if there are
-    grids to walk. So ``visit`` must compute a result that does not depend on the order, such as a sum.
+    grids to walk. With ``reach``, the medium that solid boundaries enclose is visited before the tracing too, without its
+    end. So ``visit`` must compute a result that does not depend on the order, such as a sum.
 
     Args:
         media: media and surfaces of the scene.
@@ -179,16 +180,38 @@ def visit_media(
     Returns:
         The end of the ray, and the last state.
     """
-    boxes_first = reach is not None and media.is_homogeneous
-    if boxes_first:
+    homogeneous = reach is not None and media.is_homogeneous
+    knows_medium = homogeneous and media.has_solid_surfaces
+    if homogeneous:
         for interval in find_boxed_intervals(media, ray, ray.maxt, active):
             state = visit(state, interval)
-    end, state = trace_boundaries(media, ray, medium, visit, state, active, passes_null, reach)
-    if boxes_first:
+    if knows_medium:
+        state = _visit_around(media, RaySegment(ray, medium, ray.maxt), visit, state, active)
+    trace = _visit_nothing if knows_medium else visit
+    end, state = trace_boundaries(media, ray, medium, trace, state, active, passes_null, reach)
+    if homogeneous:
         return end, state
     for interval in find_boxed_intervals(media, ray, end.t, active):
         state = visit(state, interval)
     return end, state
+
+
+def _visit_around(
+    media: SceneMedia,
+    segment: RaySegment,
+    visit: Callable[[Any, MediumInterval], Any],
+    state: Any,
+    active: mi.Bool,
+) -> Any:
+    """Visit the traced medium around the origin of a segment that stays in it."""
+    for body in media.traced:
+        on = active & (segment.medium == mi.MediumPtr(body.view.medium))
+        state = visit(state, MediumInterval(segment.ray, mi.Float(0), segment.length, on, body))
+    return state
+
+
+def _visit_nothing(state: Any, interval: MediumInterval) -> Any:
+    return state
 
 
 def revisit_media(
@@ -211,9 +234,7 @@ def revisit_media(
         for body, length in zip(media.traced, segment.passages, strict=True):
             state = visit(state, MediumInterval(segment.ray, mi.Float(0), length, active & (length > 0), body))
     elif media.stops_rays:
-        for body in media.traced:
-            on = active & (segment.medium == mi.MediumPtr(body.view.medium))
-            state = visit(state, MediumInterval(segment.ray, mi.Float(0), segment.length, on, body))
+        state = _visit_around(media, segment, visit, state, active)
     elif media.traced:
         return visit_media(media, segment.ray, segment.medium, visit, state, active, segment.passes_null)[1]
     for interval in find_boxed_intervals(media, segment.ray, segment.length, active):
@@ -223,7 +244,7 @@ def revisit_media(
 
 def find_end(media: SceneMedia, ray: Ray, medium: mi.MediumPtr, active: mi.Bool) -> SegmentEnd:
     """Follow a ray to the first opaque surface or to ``ray.maxt``, without a visit to the media on the way."""
-    return trace_boundaries(media, ray, medium, lambda state, _: state, (), active, False)[0]
+    return trace_boundaries(media, ray, medium, _visit_nothing, (), active, False)[0]
 
 
 def find_boxed_intervals(media: SceneMedia, ray: Ray, t_end: mi.Float, active: mi.Bool) -> list[MediumInterval]:
@@ -272,6 +293,7 @@ def trace_boundaries(
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
     si.wi, si.wavelengths, si.time = -ray.d, ray.wavelengths, ray.time
     if dr.hint(not media.traces, mode="scalar"):
+        state = _visit_around(media, RaySegment(ray, medium, ray.maxt), visit, state, active)
         return SegmentEnd(si, mi.Float(ray.maxt), medium, 1.0), state
     is_shadow_ray = passes_null
     passes_null &= media.has_null_transmission
@@ -297,6 +319,9 @@ def trace_boundaries(
         going &= meets
     if dr.hint(media.has_solid_surfaces, mode="scalar"):
         hit, t_hit, medium, _ = _find_surface(media, ray, onward, medium, t, going)
+        for body in media.traced:
+            on = going & (medium == mi.MediumPtr(body.view.medium))
+            state = visit(state, MediumInterval(ray, t, t_hit, on, body))
         return SegmentEnd(dr.select(going, hit, si), dr.select(going, t_hit, t), medium, 1.0), state
     null_transmission = dr.full(mi.Spectrum, 1, dr.width(ray)) if passes_null else 1.0
 

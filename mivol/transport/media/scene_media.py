@@ -69,7 +69,7 @@ class SceneMedia:
         self.start, self.locates_camera = start, locates_camera
         self.size = mi.Float(opaque_numbers(np.array([size], np.float64))[0])
         self.stops_rays = stops_rays
-        self.has_solid_surfaces = has_surfaces and stops_rays and tracer is not None and not self.traced
+        self.has_solid_surfaces = has_surfaces and stops_rays and (tracer is not None or not self.boxed)
         self.surface_boxes = surface_boxes and [
             [[mi.Float(v) for v in row] for row in opaque_rows(rows)] for rows in surface_boxes
         ]

@@ -299,7 +299,9 @@ class FreeFlight:
         )
         collides = active & (flight.t < mi.Float64(end.t))
         t = dr.select(collides, flight.t, mi.Float64(end.t))
-        passed = RaySegment.upto(ray, segment.medium, t, flight.passages)
+        # A flight without a collision may not have known where its medium ends.
+        passages = flight.passages and [dr.minimum(length, mi.Float(t)) for length in flight.passages]
+        passed = RaySegment.upto(ray, segment.medium, t, passages)
         if media.is_bounded:
             # One point of the flight estimates the derivatives of bounded media.
             _, (passed.u,) = draw_pcg32(flight.rng, 1)
