@@ -26,7 +26,7 @@ from mivol.scene.nesting import shape_bounds
 from mivol.scene.survey import OUTSIDE_SHAPES, Boundary, SceneSurvey, is_instance
 from mivol.scene_graph import list_values, traverse_children
 from mivol.transport.estimators.lighting.direct_lighting import power_heuristic
-from mivol.transport.estimators.lighting.emission_sampling import EmissionTable, EmittingBox, tabulate_emission
+from mivol.transport.estimators.lighting.emission_sampling import CELLS_PER_AXIS, EmissionTable, EmittingBox, tabulate_emission
 from mivol.transport.media.body import Body
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.media.ray_intervals import RaySegment, draw_uniform_point, find_end
@@ -43,7 +43,9 @@ SIDE, DIRECTIONS, SEED = 32, 32, 0xF12E
 def read_media_light(
     media: SceneMedia, boundaries: Sequence[Boundary], scattering: Sequence[Body], sensor: mi.Sensor, survey: SceneSurvey
 ) -> MediaLight | None:
-    """Locate the light of media, and predict the gain of sampling, once for each state of the media.
+    """Locate the light of media, once for each state of the media, and predict the gain of sampling.
+
+    A gain is kept while the light has hardly changed: a stale gain affects noise only, not the mean.
 
     Returns:
         The light; None if the place of an emitting medium is unknown, because the medium fills no shape or shapes are
@@ -55,12 +57,29 @@ def read_media_light(
     # Keep the arrays with the result, so that Dr.Jit cannot give their indices to other arrays.
     arrays = [array for box in boxes for array in _emission_state(box.body.view)]
     state = (*(a.index if dr.is_array_v(a) else a for a in arrays), *(box.box.to_world.tobytes() for box in boxes))
-    if survey.media_light is None or survey.media_light[0] != state:
+    known = survey.media_light
+    if known is None or known[0] != state:
         with without_garbage_collection(), dr.suspend_grad():
             table = tabulate_emission(boxes, media.channels)
-            gain = predict_gain(media, table, sensor, scattering)
-        survey.media_light = (state, arrays, MediaLight(table.density, table.cumulative, gain))
+            before = None if known is None else known[3]
+            if before is None or not _is_alike(table, *before[:2]):
+                gain = predict_gain(media, table, sensor, scattering)
+                before = table.density, [each.box for each in table.boxes], gain
+        survey.media_light = (state, arrays, MediaLight(table.density, table.cumulative, before[2]), before)
     return survey.media_light[2]
+
+
+MAX_MOVED = 0.1
+"""Share of the light that may move to other cells, and way of a box over its edge, for which a predicted gain is kept [1]."""
+
+
+def _is_alike(table: EmissionTable, density: mi.Float, places: Sequence[Box]) -> bool:
+    """Whether a table has hardly changed from another one, which is given by its density and the places of its boxes."""
+    boxes = [each.box for each in table.boxes]
+    way = max(np.abs(now.corners() - old.corners()).max() / old.edge for now, old in zip(boxes, places, strict=True))
+    volumes = [dr.full(mi.Float, each.cell_volume, CELLS_PER_AXIS**3) for each in table.boxes]
+    change = dr.sum(dr.abs(table.density - density) * dr.concat(volumes))
+    return way <= MAX_MOVED and float(change[0]) <= 2 * MAX_MOVED
 
 
 def find_emitting_boxes(media: SceneMedia, boundaries: Sequence[Boundary]) -> list[EmittingBox] | None:
@@ -70,15 +89,19 @@ def find_emitting_boxes(media: SceneMedia, boundaries: Sequence[Boundary]) -> li
     for body in media.bodies:
         if not body.view.emits:
             continue
-        places = _emission_boxes(body.view)
         if body.box is not None:
-            places.append(body.box.to_world)
+            around = body.box.to_world
         elif body.view.medium.ptr in lost or has_instances:
             return None
         else:
-            places.append(_box_of_shapes(scene, body.view.medium))
-        boxes.append(EmittingBox(body, Box(min(places, key=lambda m: abs(np.linalg.det(m[:3, :3]))))))
+            around = _box_of_shapes(scene, body.view.medium)
+        boxes.append(EmittingBox(body, Box(find_light_place(body.view, around))))
     return boxes
+
+
+def find_light_place(view: MediumView, around: np.ndarray) -> np.ndarray:
+    """The smallest box around the light of a medium: its boundary ``around``, or a grid."""
+    return min([*_emission_boxes(view), around], key=lambda m: abs(np.linalg.det(m[:3, :3])))
 
 
 def _emission_boxes(view: MediumView) -> list[np.ndarray]:

@@ -102,15 +102,19 @@ def find_needs(
         emitter_distances=find_emitter_distances(scene, boundaries, media),
         endless_media=_name_endless_media(scene, start, boundaries, views),
     )
-    scatters = needs.surfaces or any(m.is_scattering for m in media)
-    refused = any(m.bounded or m.has_own_walk for m in media)
-    if is_recording() or refused or not (reads_emission and scatters and any(m.emits for m in media)):
+    return locate_light(needs, scene, sensor, survey) if reads_emission else needs
+
+
+def locate_light(needs: Needs, scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey) -> Needs:
+    """The facts, which have views of the media, with the light that media emit."""
+    scatters = needs.surfaces or any(m.is_scattering for m in needs.media)
+    refused = any(m.bounded or m.has_own_walk for m in needs.media)
+    if is_recording() or refused or not (scatters and any(m.emits for m in needs.media)):
         return needs
-    bodies = [boundary.body(view) for boundary, view in zip(boundaries, views, strict=True)]
-    scattering = [body for body, facts in zip(bodies, media, strict=True) if facts.is_scattering]
+    bodies = [boundary.body(view) for boundary, view in zip(needs.boundaries, needs.views, strict=True)]
+    scattering = [body for body, facts in zip(bodies, needs.media, strict=True) if facts.is_scattering]
     media = needs.make_media(scene, bodies, survey.size, survey.usable_tracer)
-    light = read_media_light(media, boundaries, scattering, sensor, survey)
-    return replace(needs, media_light=light)
+    return replace(needs, media_light=read_media_light(media, needs.boundaries, scattering, sensor, survey))
 
 
 def read_media(boundaries: Sequence[Boundary], views: Sequence[MediumView], survey: SceneSurvey) -> tuple[MediumFacts, ...]:

@@ -474,8 +474,10 @@ def build_estimators(
 def _make_emission_sampling(scene: mi.Scene, media: SceneMedia, needs: Needs) -> EmissionSampling:
     """Make the estimator of the light of media from the table of the needs."""
     light = needs.media_light
-    table = EmissionTable(find_emitting_boxes(media, needs.boundaries), light.density, light.cumulative)
-    return EmissionSampling(media, table)
+    boxes = find_emitting_boxes(media, needs.boundaries)
+    for box in boxes:
+        box.rows, box.to_world  # noqa: B018  (read now, with the placements)
+    return EmissionSampling(media, EmissionTable(boxes, light.density, light.cumulative))
 
 
 def _make_visibility_cache(

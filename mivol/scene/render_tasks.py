@@ -16,13 +16,14 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.kernel_recording import RecordedTask, copy_aligned, is_recording
-from mivol.scene.media_light import MediaLight
+from mivol.scene.media_light import MediaLight, find_light_place
 from mivol.scene.needs import Needs
 from mivol.scene.plan import Plan, Readings, build_estimators
 from mivol.scene.scene_state import SceneState, find_hidden_arrays
 from mivol.scene.survey import SceneSurvey
 from mivol.space import lattice_from_world
 from mivol.transport.estimators.lighting.bright_map import BrightMap
+from mivol.transport.estimators.lighting.emission_sampling import place_cells
 from mivol.transport.estimators.lighting.tabulated_shadows import place_nodes
 from mivol.transport.estimators.scores import Primal, Replay, Tangent
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
@@ -86,6 +87,7 @@ class PlannedScene:
         layout: of ``arrays.placements``.
         unrecorded: why renders are not recorded; None if they are.
         image_plan: plan of the image from which derivatives were planned; None if they were planned by themselves.
+        may_gain: whether a gain of sampling the light of media was predicted, at the time of the plan.
     """
 
     state: SceneState
@@ -98,6 +100,7 @@ class PlannedScene:
     layout: PlacementLayout
     unrecorded: str | None = None
     image_plan: Plan | None = None
+    may_gain: bool = False
 
     def read_arrays(self) -> PreparedArrays:
         """The arrays of the next call. The derivatives of a phase function belong to one step, so they are not kept."""
@@ -127,8 +130,8 @@ class PlacementLayout:
         places: index of the first number of each group, by the bytes of the group.
         scales: scale of the medium in each boundary if Mitsuba holds it as a number. A task keeps the first, whose bytes
             lead to the present one.
-        key: all places that a recording does not follow: those of grids, and of all else among media that emit. Also what the
-            host decides by places: which groups are equal, which boundaries cut grids or are upright, which media have a scale
+        key: all places that a recording does not follow: those of grids, and all if a medium that emits fills no box. Also
+            what the host decides: which groups are equal, which boundaries cut grids or are upright, which media have a scale
             of 1, and the nodes of the table of shadows.
     """
 
@@ -160,15 +163,21 @@ def prepare_placements(needs: Needs, size: float, shadow_nodes: int) -> tuple[mi
         groups += [np.array([box.edge])] if box is not None else []
         lattices = (part.lattice for part in view.parts if part.lattice is not None)
         grids += [lattice_from_world(lattice.to_world, lattice.res) for lattice in lattices if lattice.to_world is not None]
+        if view.emits:
+            grids += [stock.from_world for stock in view.stock_boxes.values()]
+            groups += [place_cells(box)] if box is not None else []
     groups += [np.array([scale]) for scale in scales if scale is not None]
     groups += [*(needs.surface_boxes or ()), *grids]
     firsts = np.cumsum([0, *(group.size for group in groups)])
     numbers = copy_aligned(np.concatenate([group.ravel() for group in groups]))
     places = {group.tobytes(): int(k) for group, k in zip(groups[::-1], firsts[-2::-1], strict=True)}
-    kept = groups if any(view.emits for view in needs.views) else grids
+    glows = [(view, box) for view, box in zip(needs.views, boxes, strict=True) if view.emits]
+    kept = groups if any(box is None for _, box in glows) else grids
     key = (*(places[group.tobytes()] for group in groups), *map(cuts_grids, needs.views, boxes, holes), *nodes)
     key += tuple(scale == 1 for scale in scales)
     key += tuple(box is not None and box.is_upright for box in boxes)
+    if kept is grids:
+        key += tuple(find_light_place(view, box.to_world) is box.to_world for view, box in glows)
     key += tuple(group.tobytes() for group in kept)
     return mi.Float64(numbers), PlacementLayout(places, key, scales)
 

@@ -25,8 +25,10 @@ from mivol.errors import MivolError
 from mivol.kernel_recording import CannotRecordError, Recordings, is_recording, without_garbage_collection
 from mivol.scene.choices import distance_class
 from mivol.scene.needs import (
+    Needs,
     find_emitter_distances,
     find_needs,
+    locate_light,
     may_camera_be_inside,
     read_media,
     warn_of_misplaced_grids,
@@ -340,8 +342,7 @@ class Session:
     def _renew(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, state: SceneState, for_images: bool) -> PlannedScene | None:
         """Keep the facts and the plan for other values of the media; None if they change a fact that plans depend on."""
         known, survey = self._opened.get(for_images), self._surveyed.survey
-        # The table of the light of media is made with the facts.
-        if known is None or not known.is_like(state, spp) or any(m.emits for m in known.needs.media):
+        if known is None or not known.is_like(state, spp):
             return None
         needs, arrays, has_moved = known.needs, known.arrays, survey is not known.survey
         is_placed_anew = has_moved or state.scales != known.state.scales
@@ -353,6 +354,10 @@ class Session:
             views = tuple(b.view(survey.grids) for b in boundaries)
             media = read_media(boundaries, views, survey)
             is_inside = may_camera_be_inside(scene, sensor, survey)
+            viewed = replace(needs, views=views, media=media)
+            viewed = locate_light(viewed, scene, sensor, survey) if self.settings.may_draw_emission else viewed
+        if survey.may_gain != known.may_gain:
+            return None
         if is_inside != needs.camera_inside or [plan_key(m) for m in media] != [plan_key(m) for m in needs.media]:
             return None
         if has_moved or state.lamps != known.state.lamps:
@@ -360,12 +365,12 @@ class Session:
             if list(map(distance_class, distances)) != list(map(distance_class, needs.emitter_distances)):
                 return None
             arrays = replace(arrays, balls=read_balls(scene))
-        viewed, layout = replace(needs, views=views), known.layout
+        layout = known.layout
         if is_placed_anew:
             placements, layout = prepare_placements(viewed, survey.size, known.plan.shadow_nodes)
             arrays = replace(arrays, placements=placements, tracer=survey.usable_tracer)
         readings, bright = read_parts(viewed, known.plan, survey, for_images), self._read_bright_map(scene, for_images)
-        arrays = replace(arrays, readings=readings, bright=bright)
+        arrays = replace(arrays, readings=readings, light=_read_table(viewed), bright=bright)
         self._surveyed.views = views if for_images else ()
         return replace(known, state=state, survey=survey, needs=needs, arrays=arrays, layout=layout)
 
@@ -383,18 +388,18 @@ class Session:
         plan = make_plan(needs, settings, self.aovs)
         if not self.is_depth_given:
             warn_of_last_order(scene, sensor, needs, plan, survey, settings)
-        light = None if needs.media_light is None else (needs.media_light.density, needs.media_light.cumulative)
         is_known = known is not None and known.survey is survey and known.state.others == state.others
         if not is_recording() and is_known and known.state.scales == state.scales:
             placements, layout = known.arrays.placements, known.layout
         else:
             placements, layout = prepare_placements(needs, survey.size, plan.shadow_nodes)
         readings, balls = read_parts(needs, plan, survey, for_images), None if is_recording() else read_balls(scene)
-        bright = self._read_bright_map(scene, for_images)
+        light, bright = _read_table(needs), self._read_bright_map(scene, for_images)
         arrays = PreparedArrays(readings, light, find_batch_views(sensor), placements, survey.usable_tracer, balls, bright)
         self._surveyed.views = needs.views if for_images and not is_recording() else ()
         facts = replace(needs, views=(), media_light=None)
-        opened = PlannedScene(state, spp, survey, facts, plan, arrays, settings, layout)
+        made = survey, facts, plan, arrays, settings, layout
+        opened = PlannedScene(state, spp, *made, may_gain=survey.may_gain)
         return self._find_unrecorded(opened, scene, for_images)
 
     def _read_bright_map(self, scene: mi.Scene, for_images: bool) -> BrightMap | None:
@@ -438,6 +443,11 @@ class Session:
         else:
             opened.unrecorded = find_unrecorded(scene, opened.state.sensor, spp, opened.needs, opened.plan, for_images)
         return opened
+
+
+def _read_table(needs: Needs) -> tuple[mi.Float, mi.Float64] | None:
+    """The table of the light of media; None without a table."""
+    return None if needs.media_light is None else (needs.media_light.density, needs.media_light.cumulative)
 
 
 def _list_parts(scene: mi.Scene) -> list[mi.Object]:

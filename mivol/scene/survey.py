@@ -144,8 +144,8 @@ class SceneSurvey:
         cosines: mean cosines of phase functions, by the name of the medium.
         warned: media and grids with a warning already given.
         misplaced: names of the grids of each medium that lie outside of its shapes.
-        media_light: the light of the media with the arrays behind the light (:mod:`mivol.scene.media_light`); None before the
-            first reading.
+        media_light: the light of the media with the arrays behind the light, and the density, boxes and gain of the last
+            prediction (:mod:`mivol.scene.media_light`); None before the first reading.
         gain_of_draws: measured gain of sampling the light of media [1] (:mod:`mivol.scene.previews`); None before a
             measurement.
         near_gain: measured gain of drawing the light of near emitters along segments [1]; None before a measurement.
@@ -177,6 +177,11 @@ class SceneSurvey:
     emission_noise: dict[int, OwnRaysNoise] = field(default_factory=dict)
     branch_noise: dict[int, BranchNoise] = field(default_factory=dict)
     mirror_noise: dict[int, MirrorNoise] = field(default_factory=dict)
+
+    @property
+    def may_gain(self) -> bool:
+        """Whether the last prediction found a gain of sampling the light of media."""
+        return self.media_light is not None and self.media_light[3][2] > 1
 
     @property
     def usable_tracer(self) -> mi.Scene | None:

@@ -34,7 +34,7 @@ from mivol.kernel_recording import (
     is_recording,
     without_garbage_collection,
 )
-from mivol.scene import plan, readings, render_tasks, scene_state, session
+from mivol.scene import media_light, plan, readings, render_tasks, scene_state, session
 from mivol.scene.foreign_plugins import UnfollowedStateError, describe_foreign
 from mivol.scene.scene_state import SceneState, find_hidden_arrays
 from mivol.scene.stand_in import FORMATS, StandIn, describe_kind
@@ -62,10 +62,10 @@ def lamp_in_fog() -> mi.Scene:
     return close_up({"smoke": fog, "lamp": point((0.2, 0.1, 0.3))[0], "floor": floor}, res=6)
 
 
-def fire() -> mi.Scene:
+def fire(**more: dict) -> mi.Scene:
     light = grid_volume("mivol_voxels", rough_grid(6, 1.0, (5, 4, 6)).astype(np.float32), PLACE)
     smoke = medium("mivol_medium", grid_volume("mivol_voxels", rough_grid(4, 3.0).astype(np.float32), PLACE), 0.8)
-    return close_up({"smoke": box_of(smoke | {"emission_density": light}, PLACE)}, res=6)
+    return close_up({"smoke": box_of(smoke | {"emission_density": light}, PLACE), **more}, res=6)
 
 
 def lit_by_map() -> dict:
@@ -477,6 +477,11 @@ def fog_in(shape: dict, other: dict | None = None, **more: dict) -> mi.Scene:
     return close_up({"smoke": fog, "floor": floor, "lamp": point((0.2, 0.1, 5.0))[0], **others}, res=6)
 
 
+def fire_on_a_floor() -> mi.Scene:
+    """Smoke that emits, over a floor."""
+    return fire(floor={"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.5]).scale(3)})
+
+
 def smoke_in_the_sun() -> mi.Scene:
     """Images have a table of shadows."""
     grid = medium("mivol_medium", grid_volume("mivol_voxels", rough_grid(4, 3.0).astype(np.float32), PLACE), 0.8)
@@ -516,6 +521,9 @@ MOVED_SHAPES: dict[str, tuple[Callable[[], mi.Scene], str, str]] = {
     "shape of a copy": (among_copies, "group.ball.to_world", INSIDE + "sigma_t.data"),
     "curve": (lambda: among_curves("bsplinecurve"), "curve.control_points", INSIDE + "sigma_t.data"),
     "line": (lambda: among_curves("linearcurve"), "curve.control_points", INSIDE + "albedo.value.value"),
+    "box that glows": (lambda: glowing_box(), "smoke.vertex_positions", INSIDE + "albedo.value.value"),
+    "floor by a fire": (lambda: fire_on_a_floor(), "floor.to_world", INSIDE + "sigma_t.data"),
+    "box of a fire": (lambda: fire_on_a_floor(), "smoke.vertex_positions", INSIDE + "emission_density.data"),
     "box of a grid": (smoke_under, "smoke.vertex_positions", INSIDE + "sigma_t.data"),
 }
 """A scene, a parameter that places a shape, and a parameter to differentiate."""
@@ -805,6 +813,35 @@ def test_a_new_light_of_media_is_planned_anew() -> None:
             tables.append(np.array(integrator.session._opened[True].arrays.light[0]))
     assert np.array_equal(tables[0], tables[1]) and np.array_equal(tables[2], tables[3])
     assert not np.array_equal(tables[1], tables[2])
+
+
+def test_a_light_whose_predicted_gain_grows_is_planned_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    gains = iter((0.5, 2.0))
+    monkeypatch.setattr(media_light, "predict_gain", lambda *_: next(gains))
+    scene, integrator, draws = glowing_box(), mi.load_dict(mivol(max_depth=3)), []
+    params = mi.traverse(scene)
+    corners = dr.detach(params["smoke.vertex_positions"])
+    for growth in (1, 0.7):
+        params["smoke.vertex_positions"] = corners * growth
+        params.update()
+        mi.render(scene, integrator=integrator, seed=1, spp=2)
+        draws.append(integrator.session._opened[True].plan.draws_emission)
+    assert draws == [False, True]
+
+
+def test_the_gain_of_a_light_that_hardly_changes_is_predicted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tenth of the light, or of the edge of the box, may move."""
+    scene, integrator, key = fire_on_a_floor(), mi.load_dict(mivol(max_depth=3)), INSIDE + "emission_density.data"
+    params, calls, predict = mi.traverse(scene), [], media_light.predict_gain
+    monkeypatch.setattr(media_light, "predict_gain", lambda *given: calls.append(1) or predict(*given))
+    values, corners, counts = np.array(params[key]), dr.detach(params["smoke.vertex_positions"]), []
+    half = values * np.linspace(1, 0, len(values), dtype=np.float32)[:, None, None, None]
+    for light, growth in ((values, 1), (0.7 * values, 1), (half, 1), (half, 0.98), (half, 0.7)):
+        params[key], params["smoke.vertex_positions"] = mi.TensorXf(light), corners * growth
+        params.update()
+        mi.render(scene, integrator=integrator, seed=1, spp=2)
+        counts.append(len(calls))
+    assert counts == [1, 1, 2, 2, 3]
 
 
 # -- What is traced ---------------------------------------------------------------------------------------------------------

@@ -38,7 +38,7 @@ from mivol.transport.media.body import Body, emission_slope, eval_emission
 from mivol.transport.media.extinction import colours_to_channels, to_components, to_spectrum
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.box import Box
+from mivol.transport.traversal.box import Box, opaque_rows
 from mivol.transport.traversal.grid_walk import walk_box_cells
 from mivol.transport.traversal.random_numbers import draw_pcg32
 from mivol.transport.traversal.rays import FineRay, Ray
@@ -49,6 +49,7 @@ __all__ = [
     "EmittingPoint",
     "CELLS_PER_AXIS",
     "EmissionTable",
+    "place_cells",
     "EmittingBox",
     "RayPoint",
     "RayDensity",
@@ -83,8 +84,7 @@ class EmittingBox:
     @cached_property
     def to_world(self) -> list[list[mi.Float]]:
         """The map from cells to the world."""
-        scaled = self.box.to_world @ np.diag([1 / CELLS_PER_AXIS] * 3 + [1])
-        return [[dr.opaque(mi.Float, float(v)) for v in row] for row in scaled[:3]]
+        return [[mi.Float(v) for v in row] for row in opaque_rows(place_cells(self.box))]
 
     @property
     def cell_volume(self) -> float:
@@ -98,6 +98,11 @@ class EmittingBox:
     def point_at(self, cell: mi.Point3f) -> mi.Point3f:
         """World position of a point given in cells."""
         return mi.Point3f(*(dr.fma(x, cell.x, dr.fma(y, cell.y, dr.fma(z, cell.z, rest))) for x, y, z, rest in self.to_world))
+
+
+def place_cells(box: Box) -> np.ndarray:
+    """The (3, 4) map from the cells of a box to the world."""
+    return (box.to_world @ np.diag([1 / CELLS_PER_AXIS] * 3 + [1]))[:3]
 
 
 @dataclass
