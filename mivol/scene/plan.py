@@ -64,6 +64,7 @@ from mivol.transport.estimators.flights.flight_derivatives import MIN_ALBEDO
 from mivol.transport.estimators.lighting.bright_map import BrightMap
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.lighting.emission_sampling import EmissionSampling, EmissionTable
+from mivol.transport.estimators.lighting.emitters import find_even_share
 from mivol.transport.estimators.lighting.kept_rays import MirroredEmitters
 from mivol.transport.estimators.lighting.tabulated_shadows import TransmittanceGrid
 from mivol.transport.estimators.single_scattering.near_light import NearLighting
@@ -457,6 +458,10 @@ def build_estimators(
         with dr.suspend_grad():
             direct.shadow_table = TransmittanceGrid.over_box(media, direct.emitters, needs.lit_box, plan.shadow_nodes)
     lobe = None if plan.side_flight_cosine is None else dr.opaque(mi.Float, plan.side_flight_cosine)
+    even_share = mi.Float(0)
+    if lobe is not None and not is_even and "uniform" in needs.emitter_kinds:
+        with dr.suspend_grad():
+            even_share = find_even_share(scene)
     emission = _make_emission_sampling(scene, media, needs) if plan.draws_emission else None
     long_paths_count = is_even or any(medium.emits for medium in needs.media)
     near = None
@@ -468,7 +473,7 @@ def build_estimators(
         with dr.suspend_grad():
             mirrored = MirroredEmitters(scene, direct.emitters)
     ways = lobe, emission, long_paths_count, near, mirrored
-    return Estimators(direct, segment, settings, lights_surfaces, lights_media, *ways)
+    return Estimators(direct, segment, settings, lights_surfaces, lights_media, *ways, even_share=even_share)
 
 
 def _make_emission_sampling(scene: mi.Scene, media: SceneMedia, needs: Needs) -> EmissionSampling:

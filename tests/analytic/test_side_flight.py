@@ -10,6 +10,8 @@ The path itself draws its directions with the density m: p mixed with a wider lo
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -103,10 +105,14 @@ def test_the_next_vertex_counts_by_the_balance_heuristic():
     assert np.all(np.array(aim.weight)[:10] == 1) and aim.sample is sample
 
 
-@pytest.mark.parametrize(("beta", "share"), [(0.5, AIMED_SHARE), (1.0, AIMED_SHARE), (1.01, 0.0)])
-def test_directions_are_aimed_while_the_throughput_is_low(beta, share):
-    """A share of the directions lies in a lobe about the sun; a path whose throughput has grown draws none."""
+@pytest.mark.parametrize(
+    ("beta", "even", "share"), [(0.5, 0, AIMED_SHARE), (1.0, 0, AIMED_SHARE), (1.0, 0.75, AIMED_SHARE / 4), (1.01, 0, 0.0)]
+)
+def test_directions_are_aimed_while_the_throughput_is_low(beta, even, share):
+    """A share of the directions lies in a lobe about the sun, less beside an even sky; a path whose throughput has grown draws
+    none."""
     estimators, hit = middle()
+    estimators = replace(estimators, even_share=mi.Float(even))
     sample = DistantEmitterSample.from_sample(estimators.direct.sample_emitter(hit.mei, mi.Point2f(0.5), hit.on))
     u = (np.arange(N) + 0.5) / N
     aimed = aim_at_emitter(estimators, sample, mi.Spectrum(0.1, beta, 0.2), mi.Float(u), dr.arange(mi.UInt32, N) > 9)
@@ -124,17 +130,33 @@ def test_directions_are_aimed_while_the_throughput_is_low(beta, share):
     np.testing.assert_allclose(mixed[10:], ((1 - share) * p + share * of_cosine(c, LOBE**2))[10:], rtol=1e-4)
 
 
+@pytest.mark.parametrize("sky", [0.0, 0.6])
+def test_an_even_sky_has_its_share_of_the_light(sky):
+    """4 pi times its radiance, beside the irradiance of the sun; means of the colours."""
+    even = {"sky": {"type": "constant", "radiance": sky}} if sky else {}
+    scene = close_up({"smoke": smoke(rough_grid(7), 0.9, name="hg", g=0.8)[0], "sun": small.sun([0.3, 0.2, -1.0])[0], **even})
+    irradiance = np.mean(np.array(mi.traverse(scene)["sun.irradiance.value"], np.float64))
+    survey, settings = survey_scene(scene), Settings(max_depth=3)
+    needs = find_needs(scene, scene.sensors()[0], survey)
+    made = plan.build_estimators(scene, needs, plan.make_plan(needs, settings), settings, survey, True)
+    light = 4 * np.pi * sky
+    # Some ten roundings of sums and squares of float32.
+    assert float(made.even_share[0]) == pytest.approx(light / (light + irradiance), rel=16 * 2.0**-24)
+
+
 # -- Images ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow_for("sun")
 @pytest.mark.statistical
-@pytest.mark.parametrize("lit", small.cases(["sun", "sky"], slow=("sky",)))
+@pytest.mark.parametrize("lit", small.cases(["sun", "sky", "even sky"], slow=("sky", "even sky")))
 def test_side_flights_keep_the_mean(lit, monkeypatch):
     """The same mean with and without side flights."""
     image = mi.Bitmap(np.random.default_rng(3).uniform(0, 1, (8, 16, 3)).astype(np.float32) ** 4)
-    far = {"sun": small.sun([0.3, 0.2, -1.0])[0], "sky": {"type": "envmap", "bitmap": image}}[lit]
-    scene = close_up({"smoke": smoke(rough_grid(7, 6.0), 0.9, name="hg", g=0.8)[0], "far": far}, res=8)
+    sun, sky = small.sun([0.3, 0.2, -1.0])[0], {"type": "envmap", "bitmap": image}
+    far = {"sun": [sun], "sky": [sky], "even sky": [sun, {"type": "constant", "radiance": 0.2}]}[lit]
+    emitters = {f"far_{k}": emitter for k, emitter in enumerate(far)}
+    scene = close_up({"smoke": smoke(rough_grid(7, 6.0), 0.9, name="hg", g=0.8)[0], **emitters}, res=8)
     with_them = over_pixels(small.moments(scene, mivol(max_depth=5), 256))
     monkeypatch.setattr(plan, "choose_side_flights", lambda *_: (None, []))
     without = over_pixels(small.moments(scene, mivol(max_depth=5), 256, first=500))

@@ -238,6 +238,7 @@ class Estimators:
         lights_media: emitter samples light the collisions in media too. Not used if a constant environment is the only emitter,
             since escaping paths find its light without noise.
         lobe: mean cosine of the lobe of side flights (:mod:`.side_flight`); None without side flights.
+        even_share: share of constant environments in the light of all emitters, for side flights [1].
         emission: sampler of the emission of media at scattering events; None to leave the emission to paths passing through.
         long_paths_count: long paths carry as much light as short ones (an even environment) or more (emitting media); roulette
             then spares them.
@@ -265,6 +266,7 @@ class Estimators:
     shows: str = "all"
     camera_emission: mi.Float | float = 1.0
     glass: str = "any"
+    even_share: mi.Float | float = 0.0
     media: SceneMedia = field(init=False)
     draws_shadows: bool = field(init=False)
 

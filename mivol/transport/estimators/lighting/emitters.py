@@ -30,6 +30,7 @@ __all__ = [
     "EmitterDraw",
     "SceneEmitters",
     "find_bounding_ball",
+    "find_even_share",
     "find_lit_box",
     "fractional_part",
     "is_among",
@@ -339,6 +340,14 @@ def join_arrays(values: list[mi.Float] | list[mi.UInt32]) -> mi.Float | mi.UInt3
         values = [dr.concat(values[k : k + 16]) for k in range(0, len(values), 16)]
         dr.eval(values)
     return values[0]
+
+
+def find_even_share(scene: mi.Scene) -> mi.Float:
+    """The share of constant environments in the fluence of all emitters, which are several, and all at infinity [1]."""
+    emitters = scene.emitters()
+    light = tabulate_emitters(scene.emitters_dr(), mi.Point3f(0), mi.Vector3f(1), [None] * len(emitters)).everywhere
+    even = [number for number, emitter in enumerate(emitters) if emitter.class_name() == UNIFORM_EMITTER]
+    return sum((dr.gather(mi.Float, light, mi.UInt32(number)) for number in even), mi.Float(0))
 
 
 def find_lit_box(scene: mi.Scene) -> np.ndarray:
