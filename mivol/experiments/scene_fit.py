@@ -200,8 +200,8 @@ class SceneFit(FitKind):
             run.append(**fit.evaluations[-1])
         if self.references.held_out:
             self.record.notes.append(
-                f"PSNR of the held-out views is the mean over {len(self.references.held_out)} views, the same at each point "
-                "of the curve; the peak is the largest value of each reference."
+                f"PSNR is the mean over all held-out views ({len(self.references.held_out)}) at each point of the curve; the "
+                "peak is the largest value of each reference."
             )
         self.record.notes += fit.log + ([f"stopped early: {fit.run.stop_reason}"] if fit.run.stop_reason else [])
 

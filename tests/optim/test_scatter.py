@@ -51,6 +51,13 @@ def test_no_scattered_light_is_none(variant_rgb) -> None:
     assert np.abs(found.light / found.sigma).max() < 3
 
 
+def test_the_noise_of_a_pixel_counts_up_to_a_bound(variant_rgb) -> None:
+    """The mean of a logarithm is corrected for a variance of at most a quarter: half a quantum and two quanta are alike."""
+    y, weights, _ = scan(BEAM, scattered(0.05))
+    lights = [fit_scatter(BEAM, y, np.full_like(weights, quanta)).light for quanta in (0.5, 2.0)]
+    np.testing.assert_array_equal(*lights)
+
+
 def test_air_that_scattered_light_brightens_is_no_light(variant_rgb) -> None:
     """Views divided by the air: the light is 1 less what is scattered there. Flats of .8 of the exposure cancel."""
     truth = scattered(0.05)
