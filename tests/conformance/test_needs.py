@@ -61,12 +61,14 @@ def traced_rays(code: str) -> int:
 
 
 def test_grey_field_carries_one_channel():
-    """A homogeneous medium reads no grid; a grey one 8 corners and then 4 a cell; an rgb one three times that."""
+    """A homogeneous medium reads no grid; a grey one 8 corners and then 4 a cell; an rgb one three times that. Both place the
+    grid by 12 numbers, and the homogeneous medium its upright box by 6.
+    """
     none = lookups(kernels(scene_of(sigma_t=0.7)))
     grey = lookups(kernels(scene_of()))
     rgb = lookups(kernels(scene_of(sigma_t=grid_volume("mivol_voxels", values(3), PLACE))))
-    assert grey - none == 8 + 4
-    assert rgb - none == 3 * (8 + 4)
+    assert grey - none == 6 + 8 + 4
+    assert rgb - none == 6 + 3 * (8 + 4)
 
 
 def test_albedo_is_not_looked_up():
