@@ -23,6 +23,7 @@ from mivol.scene.plan import build_estimators, make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.flights.baseline import BLOCKS, Baseline, BaselineSums
 from mivol.transport.estimators.scores import Replay
+from mivol.transport.estimators.single_scattering.near_light import NearLightPlace
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path import derivatives
 from mivol.transport.path.derivatives import count_baseline_paths, count_branches, prepare_derivatives
@@ -145,6 +146,37 @@ def test_listed_probes_add_what_probes_add_in_their_lanes(name: str, monkeypatch
         found.append(gradient_of_mean_image(SCENES[name](), KEYS["density"], 64, fresh(3)))
     # A voxel has at most 4096 float32 terms of both signs.
     np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-5 * np.abs(found[1]).max())
+
+
+def lit_inside(lamp: dict) -> mi.Scene:
+    """A lamp inside of smoke: segments draw its light."""
+    density = grid_volume("mivol_voxels", 0.5 + rough_grid(4, 3.0), PLACE)
+    return close_up({"smoke": box_of(medium("mivol_medium", density, 0.8), PLACE), "lamp": lamp}, res=8)
+
+
+BULB = {"type": "point", "position": [0.2, 0.1, 0.3], "intensity": 4.0}
+BALL = {"type": "sphere", "center": [0.2, 0.1, 0.3], "radius": 0.1, "emitter": {"type": "area", "radiance": 30.0}}
+LAMPS = {"density": (BULB, KEYS["density"], 5), "some": (BULB, "lamp.position", 1), "ball": (BALL, KEYS["density"], 5)}
+
+
+@pytest.mark.parametrize("name", cases(LAMPS, slow=("ball",)))
+def test_a_replay_reads_where_the_walk_has_found_near_light(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With places of near light in memory for no, some or all segments: the same terms, up to rounding of the weights."""
+    (lamp, key, most), found = LAMPS[name], []
+    monkeypatch.setattr(derivatives, "MIN_LISTED", 1)
+    for places in (0, most):
+        monkeypatch.setattr(derivatives, "MAX_PLACES", places)
+        found.append(gradient_of_mean_image(lit_inside(lamp), key, 64, fresh(3)))
+    # 4096 float32 terms of both signs.
+    np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-5 * np.abs(found[0]).max())
+
+
+def test_a_replay_walks_no_near_light_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Places without light, in the place of those in memory, leave no derivative by the lamp."""
+    real = NearLightPlace.at
+    monkeypatch.setattr(derivatives, "MIN_LISTED", 1)
+    monkeypatch.setattr(NearLightPlace, "at", lambda *given: replace(real(*given), reach=mi.Float(0)))
+    assert not np.any(gradient_of_mean_image(lit_inside(BULB), "lamp.intensity.value", 64, fresh(3)))
 
 
 @pytest.mark.parametrize(("density", "share"), [(0.0, 1.0), (8.0, 4 * 0.3 / 8.3)])

@@ -22,7 +22,7 @@ References: Arvo & Kirk 1990 (splitting); Vicini et al. 2021 (path replay).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -31,6 +31,7 @@ from mivol.transport.estimators.flights.baseline import Baseline, BaselineSums
 from mivol.transport.estimators.flights.flight_derivatives import Probe, ProbeTerm
 from mivol.transport.estimators.scores import Factor, Replay, Rest, Tangent
 from mivol.transport.estimators.segment import KnownFlight, SegmentTransmittance
+from mivol.transport.estimators.single_scattering.near_light import NearLightPlace
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays
@@ -38,6 +39,7 @@ from mivol.transport.path.successive import walk_from_points
 from mivol.transport.path.walk import (
     Path,
     PathStart,
+    SegmentNumber,
     add_probes,
     leave_camera_from_memory,
     walk_from_camera,
@@ -70,6 +72,9 @@ USUAL_NOISE = 0.15
 MIN_LISTED = 1 << 14
 """Smallest number of rays in a pass whose probes are listed, and walk in a kernel of their own. In smaller passes a path walks
 on from its own probes, since fewer kernels matter more there."""
+
+MAX_PLACES = 5
+"""Largest number of segments of a branch whose places of near light are kept for its replay."""
 
 MAX_SORTED_LENGTH = 0xFFF
 """Largest number of scattering events told apart when branches are sorted by length."""
@@ -112,12 +117,21 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
     """
     first, replayed = rays.sampler.clone(), estimators.replayed()
     start = leave_camera_from_memory(estimators, rays.sampler, rays.ray)
-    n = dr.width(start.ray)
+    n, rooms = dr.width(start.ray), _count_places(estimators)
+    if n >= MIN_LISTED and rooms > 0:
+        places = NearLightPlace.empty((rooms + 1) * n)
+        dr.eval(places)
+        estimators = replace(estimators, places=places)
+        replayed = replace(replayed, places=places, writes_places=True)
+        start.number = SegmentNumber(dr.arange(mi.UInt32, n), dr.full(mi.UInt32, 1, n))
+        dr.make_opaque(start.number)
 
     # -- The radiance of stems and branches ------------------------------------------------------------------------------
     stem_light, _, stems = walk_light(replayed, start.clone(), stops=True)
     dr.schedule(dL)
     branching = _Branching.of(estimators, stems, first)
+    if start.number is not None:
+        branching.rooms = rooms
     _, branches = branching.gather(dr.arange(mi.UInt32, n))
     L, _, path = walk_light(replayed, branches.in_memory(), stops=False)
     lengths = _Lengths.of(path.depth)
@@ -144,6 +158,13 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
     replay_in_one_kernel(n, replay)
     if listed is not None:
         listed.add_derivatives(estimators, start.ray.wavelengths)
+
+
+def _count_places(estimators: Estimators) -> int:
+    """The number of segments of a branch whose places of near light are worth keeping."""
+    if estimators.near is None or not estimators.near.has_places:
+        return 0
+    return min(MAX_PLACES, max(0, estimators.settings.depth_limit - 2))
 
 
 def carry_tangents(estimators: Estimators, rays: CameraRays) -> mi.Spectrum:
@@ -199,6 +220,7 @@ class _Branching:
         place: place of each stem with a collision in ``collided``.
         count: number of these stems (an array of one number).
         each: branches of a stem (an array of one number).
+        rooms: segments of a branch whose places of near light are in memory, behind those of stems.
     """
 
     start: PathStart
@@ -206,6 +228,7 @@ class _Branching:
     place: mi.UInt32
     count: mi.UInt32
     each: mi.UInt32
+    rooms: int = 0
 
     @classmethod
     def of(cls, estimators: Estimators, stems: Path, sampler: SpreadSampler) -> _Branching:
@@ -238,6 +261,9 @@ class _Branching:
         stem = dr.gather(mi.UInt32, self.collided, number // self.each, on)
         start = self.start.gather(stem, on)
         start.sampler = start.sampler.branch(number % self.each, self.each)
+        if self.rooms:
+            n = dr.width(number)
+            start.number = SegmentNumber(number + n, dr.full(mi.UInt32, self.rooms, n))
         return stem, start
 
     def add_light(self, stems: mi.Spectrum, branches: mi.Spectrum) -> mi.Spectrum:

@@ -17,7 +17,7 @@ from mivol.transport.estimators.lighting.emission_sampling import EmissionSampli
 from mivol.transport.estimators.lighting.kept_rays import KeptMirror, KeptRay, MirroredEmitters
 from mivol.transport.estimators.lighting.tabulated_shadows import KeptShadow, TransmittanceGrid
 from mivol.transport.estimators.segment import Absorption, SegmentEstimator, TrackedAbsorption
-from mivol.transport.estimators.single_scattering.near_light import NearLighting
+from mivol.transport.estimators.single_scattering.near_light import NearLighting, NearLightPlace
 from mivol.transport.estimators.single_scattering.scattering_quadrature import ScatteringQuadrature
 from mivol.transport.estimators.single_scattering.single_scattering import SingleScattering
 from mivol.transport.estimators.single_scattering.visibility_cache import VisibilityCache
@@ -248,6 +248,8 @@ class Estimators:
         glass: what the first smooth glass of a camera ray does to it: "any" by chance, "transmits", or "mirrors"; the light of
             the last two adds up to that of the first.
         mirrored: guesses of the light in mirrors, for kept rays (:mod:`.kept_rays`); None to find lamps in mirrors by chance.
+        places: places of near light in memory, for walks and their replays (:class:`SegmentNumber`); None without them.
+        writes_places: walks write their places; replays read them.
         shows: emitters that the camera sees directly: "all", the "lamps" (emitters with a surface), or the "rest".
         media: media of the scene.
         draws_shadows: shadow rays of vertices are estimated, by tracking or by roulette, with a random number.
@@ -264,6 +266,8 @@ class Estimators:
     near: NearLighting | None = None
     mirrored: MirroredEmitters | None = None
     shows: str = "all"
+    places: NearLightPlace | None = None
+    writes_places: bool = False
     camera_emission: mi.Float | float = 1.0
     glass: str = "any"
     even_share: mi.Float | float = 0.0

@@ -92,6 +92,24 @@ by 1.1 times in a glass of milk, 1.3 times in a dense cloud, 1.6 to 1.7 times in
 
 
 @dataclass
+class SegmentNumber:
+    """The number of the next segment of a path in the memory of its places of near light.
+
+    Attributes:
+        index: index in memory.
+        left: number of segments that have room there.
+    """
+
+    index: mi.UInt32
+    left: mi.UInt32
+
+    def after(self, stride: int, on: mi.Bool) -> SegmentNumber:
+        """The number after a segment, in lanes that have followed it."""
+        following, left = self.index + stride, dr.maximum(self.left, 1) - 1
+        return SegmentNumber(dr.select(on, following, self.index), dr.select(on, left, self.left))
+
+
+@dataclass
 class Path:
     """The state of a path.
 
@@ -121,6 +139,7 @@ class Path:
         mirror: kept ray mirrored by glass; None if mirrored paths find lamps by chance.
         mirrored: lanes mirrored by the last event, with the mirrored ray offered to ``mirror``; None without ``mirror``.
         met_glass: lanes that have met smooth glass; None if chance decides what glass does (``Estimators.glass``).
+        number: number of the next segment among those whose places of near light are in memory; None without them.
     """
 
     ray: FineRay
@@ -146,6 +165,7 @@ class Path:
     met_glass: mi.Bool | None = None
     mirror: KeptMirror | None = None
     mirrored: mi.Bool | None = None
+    number: SegmentNumber | None = None
 
 
 @dataclass
@@ -160,6 +180,7 @@ class PathStart:
         active: lanes to walk.
         flight: first flights of camera rays, on where they are known, or the collisions.
         at_collision: lanes that start at the end of their flight.
+        number: as of :class:`Path`.
     """
 
     ray: Ray
@@ -171,6 +192,7 @@ class PathStart:
     active: mi.Bool
     flight: KnownFlight | None
     at_collision: mi.Bool
+    number: SegmentNumber | None = None
 
     @classmethod
     def at_stop(cls, path: Path, sampler: SpreadSampler) -> PathStart:
@@ -197,6 +219,7 @@ class PathStart:
             write(self.active),
             KnownFlight(*(write(values) for values in (flight.t, flight.body, flight.on))),
             write(self.at_collision),
+            self.number and SegmentNumber(write(self.number.index), write(self.number.left)),
         )
 
     def with_flight(self) -> PathStart:
@@ -281,7 +304,7 @@ def begin_path(estimators: Estimators, start: PathStart, score: Score, *probes: 
     path.medium = start.medium
     path.beta, path.eta, path.depth = path.beta * start.beta, path.eta * start.eta, path.depth + start.depth
     path.is_opaque |= not estimators.settings.hide_emitters and estimators.media.scene.environment() is not None
-    path.known = start.flight
+    path.known, path.number = start.flight, start.number
     return _sample_first_emitter(estimators, _start_reservoirs(estimators, path, *probes))
 
 
@@ -668,8 +691,16 @@ def _sample_far_emitter(
 def _add_near_light(estimators: Estimators, path: Path, segment: PathSegment, length: mi.Float) -> Path:
     """Add the light of near emitters scattered along a segment."""
     attached = path.score.purpose != IMAGE
-    samples = estimators.near.draw(path.sampler, path.active & segment.may_scatter)
-    near = estimators.near.estimate(segment, length, samples, attached, path.active)
+    on, number, known = path.active & segment.may_scatter, path.number, None
+    samples = estimators.near.draw(path.sampler, on)
+    if number is not None:
+        stored = on & (number.left > 0)
+        if not estimators.writes_places:
+            known = estimators.places.at(number.index, stored), stored
+        path.number = number.after(dr.width(path.ray), on)
+    near = estimators.near.estimate(segment, length, samples, attached, path.active, known)
+    if number is not None and estimators.writes_places:
+        estimators.places.set(number.index, near.place, stored)
     path.score = path.score.add(near.light)
     if path.tabulated is not None:
         path.tabulated = path.tabulated.offer(near.tabulated, near.chance, near.shadow.active)

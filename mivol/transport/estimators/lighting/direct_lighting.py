@@ -67,12 +67,14 @@ class DirectSample:
         ray_segment: the shadow ray.
         value: radiance, with derivatives on request; the optical depth along the ray is detached.
         on: lanes receiving light.
+        T: transmittance of the ray, or an estimate; 0 if a surface blocks it, -1 if the ray was not followed [1].
         shadow: shadow read from a table, with the light that it dims, for vertices in media; None without a table.
     """
 
     ray_segment: RaySegment
     value: mi.Spectrum
     on: mi.Bool
+    T: mi.Spectrum
     shadow: TabulatedShadow | None = None
 
 
@@ -228,7 +230,13 @@ class DirectLighting:
         return replace(sample, density=self.near_emitters.pdf_direction(it, sample.direct, active))
 
     def estimate_at_vertex(
-        self, vertex: Vertex, sample: EmitterSample, attached: bool, active: mi.Bool, rng: mi.UInt32 | None = None
+        self,
+        vertex: Vertex,
+        sample: EmitterSample,
+        attached: bool,
+        active: mi.Bool,
+        rng: mi.UInt32 | None = None,
+        known: tuple[mi.Float, mi.Bool] | None = None,
     ) -> DirectSample:
         """Estimate the direct light at a vertex of a path by one emitter sample; the path's next segment is the second sample.
 
@@ -238,6 +246,7 @@ class DirectLighting:
             attached: keep the derivatives of the emitter and of the BSDF or phase function.
             active: lanes to estimate.
             rng: state of the random number generator for an estimated shadow; None means an exact shadow.
+            known: ``T`` of the same sample in an earlier walk, and lanes with such a sample.
 
         Bias: none. Variance: one emitter sample. Cost: one shadow ray.
         """
@@ -248,12 +257,17 @@ class DirectLighting:
             # A dark sample needs no shadow ray. It may have derivatives, of a BSDF that is 0.
             on &= dr.any(scattered * sample.weight != 0)
         start, medium = vertex.leave(direct.p)
-        shadow, traced = None, on
+        shadow, traced, is_followed, is_known = None, on, mi.Bool(on), mi.Bool(False)
+        if known is not None:
+            is_known = known[1] & (known[0] >= 0)
+            traced = on & ~is_known
         if self.shadow_table is not None:
             inside = on & vertex.in_medium
             number = self.emitters.number_of(sample.emitter)
             shadow, traced = TabulatedShadow.look_up(self.shadow_table, start, medium, direct, number, inside), on & ~inside
         ray_segment, clear, tau, light = trace_shadow_ray(self.media, start, medium, direct, traced, rng)
+        if known is not None:
+            tau, light, clear = None, dr.select(is_known, known[0], light), dr.select(is_known, known[0] > 0, clear)
         on &= clear
         w_mis = mi.Float(1)
         if sample.has_alternative is not False:
@@ -278,10 +292,11 @@ class DirectLighting:
             # A density of 0 makes the source infinite. These lanes are not active, but 0 * inf in their derivative would be
             # NaN.
             value = dr.select(on, factor * scattered * dr.select(direct.pdf > 0, source, 0), 0)
+        T = dr.select(is_followed, dr.select(on, light, 0), -1)
         if shadow is None:
-            return DirectSample(ray_segment, value, on)
+            return DirectSample(ray_segment, value, on, T)
         shadow = shadow.times(dr.select(traced, 0, value))
-        return DirectSample(ray_segment, dr.select(traced, value, 0), on, shadow)
+        return DirectSample(ray_segment, dr.select(traced, value, 0), on, T, shadow)
 
     def estimate_in_medium(
         self,
@@ -347,7 +362,7 @@ class DirectLighting:
             if attached:
                 weight = vertex.eval(wo, on) / pdf
             value = dr.select(on, factor * weight * emitter.eval(si, on), 0)
-        return DirectSample(RaySegment(ray, mei.medium, end.t, True, passages=passages), value, on)
+        return DirectSample(RaySegment(ray, mei.medium, end.t, True, passages=passages), value, on, light)
 
 
 def _draw_chosen(

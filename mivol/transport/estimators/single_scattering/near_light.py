@@ -48,6 +48,7 @@ from mivol.transport.estimators.single_scattering.single_scattering import (
     event_coefficients,
     event_interaction,
 )
+from mivol.transport.media.extinction import to_components
 from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.traversal.random_numbers import SpreadSampler, draw_pcg32, draw_state, fork_state
@@ -152,6 +153,41 @@ class NearLightSamples:
 
 
 @dataclass
+class NearLightPlace:
+    """Where a walk has found the near light of a segment, for the replay of the walk.
+
+    Attributes:
+        t: distance on the ray [length].
+        body: index of the medium.
+        sigma_t: extinction [1/length].
+        reach: transmittance up to the point, over the density of its distance [length]; 0 without light.
+        shadow: transmittance of the shadow ray, as in :class:`.DirectSample` [1].
+    """
+
+    t: mi.Float64
+    body: mi.UInt32
+    sigma_t: mi.Float
+    reach: mi.Float
+    shadow: mi.Float
+
+    @classmethod
+    def empty(cls, count: int) -> NearLightPlace:
+        """Room in memory for many places."""
+        kinds = mi.Float64, mi.UInt32, mi.Float, mi.Float, mi.Float
+        return cls(*(dr.empty(kind, count) for kind in kinds))
+
+    def at(self, index: mi.UInt32, active: mi.Bool) -> NearLightPlace:
+        """The places with an index; those of inactive lanes are without light."""
+        arrays = self.t, self.body, self.sigma_t, self.reach, self.shadow
+        return NearLightPlace(*(dr.gather(type(a), a, index, active) for a in arrays))
+
+    def set(self, index: mi.UInt32, place: NearLightPlace, active: mi.Bool) -> None:
+        """Write places to memory."""
+        for name, array in vars(self).items():
+            dr.scatter(array, getattr(place, name), index, active)
+
+
+@dataclass
 class NearLight:
     """The light of near emitters scattered along a segment.
 
@@ -159,12 +195,14 @@ class NearLight:
         light: the light as a term.
         shadow: its shadow ray.
         chance: uniform random number in [0, 1), by which a shadow ray of the path is kept.
+        place: where the light was found.
         tabulated: the same shadow ray with its shadow read from a table; None without a table.
     """
 
     light: ScatteredLight
     shadow: DirectLight
     chance: mi.Float
+    place: NearLightPlace
     tabulated: TabulatedShadow | None = None
 
 
@@ -196,6 +234,12 @@ class NearLighting:
         self._is_aimed = None
         if len(self._mixed) > MAX_MIXED and not all(aimed):
             self._is_aimed = join_arrays([dr.opaque(mi.Float, a) for a in aimed])
+
+    @property
+    def has_places(self) -> bool:
+        """Whether a :class:`NearLightPlace` tells all that a walk finds: grids of one channel, and no tinted shadows."""
+        media = self.media
+        return media.channels == 1 and not (media.is_bounded or media.is_homogeneous or media.has_null_transmission)
 
     def draw(self, sampler: mi.Sampler | SpreadSampler, active: mi.Bool) -> NearLightSamples:
         """Draw the random numbers of a segment."""
@@ -238,11 +282,26 @@ class NearLighting:
         return dr.select(is_far, axis * inverse, mi.Vector3f(0, 0, 1)), share
 
     def estimate(
-        self, segment: PathSegment, length: mi.Float, samples: NearLightSamples, attached: bool, active: mi.Bool
+        self,
+        segment: PathSegment,
+        length: mi.Float,
+        samples: NearLightSamples,
+        attached: bool,
+        active: mi.Bool,
+        known: tuple[NearLightPlace, mi.Bool] | None = None,
     ) -> NearLight:
-        """Estimate the light of a segment of known length."""
+        """Estimate the light of a segment of known length.
+
+        Args:
+            segment, length: the segment.
+            samples: its random numbers.
+            attached: keep derivatives.
+            active: lanes to follow.
+            known: the places found by an earlier walk of the same segments, and lanes in which they are known.
+        """
         media, ray = self.media, segment.ray
-        on = active & segment.may_scatter
+        everywhere = active & segment.may_scatter
+        on = everywhere if known is None else everywhere & ~known[1]
         rng, (chance,) = draw_pcg32(samples.rng, 1)
         # -- The distance ------------------------------------------------------------------------------------------------
         chosen = self.emitters.choose_emitter(ray, samples.which_emitter)
@@ -251,18 +310,29 @@ class NearLighting:
         reservoir = refill_reservoir(proposal, passed, start_reservoir(media, [rng]), on)
         (candidate,) = reservoir.candidates
         event = sample_distance(proposal, candidate, reservoir.total, samples.inside, on)
-        mei, T = event_interaction(media, ray, event), transmittance(event.tau)
+        T = transmittance(event.tau)
         if not proposal.is_exact:
             before = RaySegment.upto(ray, segment.medium, event.t)
             T = segment_transmittance(media, before, event.on, fork_state(candidate.rng, 1))
-        gain = dr.select(event.on, segment.beta * T / event.pdf, 0)
+        reach = dr.select(event.on, T / event.pdf, 0)
+        if known is not None:
+            place, is_known = known
+            event.t, event.body = dr.select(is_known, place.t, event.t), dr.select(is_known, place.body, event.body)
+            event.sigma_t = [dr.select(is_known, place.sigma_t, event.sigma_t[0])]
+            event.on = dr.select(is_known, everywhere & (place.reach > 0), event.on)
+            reach = dr.select(is_known, place.reach, reach)
+        gain = dr.select(event.on, segment.beta * reach, 0)
         # -- Direct light ------------------------------------------------------------------------------------------------
+        mei = event_interaction(media, ray, event)
         sample = self.direct.sample_near_emitter(mei, chosen, samples.emitter, event.on)
         vertex = MediumVertex(media, mei, point_along(ray, event.t))
-        direct = self.direct.estimate_at_vertex(vertex, sample, attached, event.on, candidate.rng)
+        shadows = None if known is None else (known[0].shadow, known[1])
+        direct = self.direct.estimate_at_vertex(vertex, sample, attached, event.on, candidate.rng, shadows)
         sigma_t, sigma_s = event_coefficients(media, ray, event, mei, proposal.is_exact)
         light = ScatteredLight(media, segment, Scattering(event, mei, gain, [direct], sigma_t, sigma_s, chance))
         shadow = DirectLight(media, direct.ray_segment, light.value, direct.on)
+        one = to_components(reach)[0], to_components(direct.T)[0]
+        place = NearLightPlace(event.t, event.body, event.sigma_t[0], *one)
         if direct.shadow is None:
-            return NearLight(light, shadow, chance)
-        return NearLight(light, shadow, chance, direct.shadow.times(sigma_s * gain))
+            return NearLight(light, shadow, chance, place)
+        return NearLight(light, shadow, chance, place, direct.shadow.times(sigma_s * gain))
