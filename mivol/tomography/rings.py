@@ -9,6 +9,7 @@ import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.sparse import diags_array, eye_array
 from scipy.sparse.linalg import splu, spsolve
+from scipy.stats import t
 
 from mivol.errors import MivolError
 from mivol.tomography.preprocess import LightDrift, Transmission, fit_light_drift, interpolate_gaps
@@ -35,12 +36,16 @@ ARCS, FEWEST_ARCS, VIEWS_OF_ARC = 9, 3, 16
 GAIN_DEVIATIONS = 3.0
 """Standard errors above which gains count as found; scans without rings have up to 1.6."""
 
-COLUMN_DEVIATIONS = 5.0
-"""Deviations above which the offset of a single column counts as a gain: by chance one in 10,000; 6 leave more rings."""
+COLUMN_CHANCE = 1e-5
+"""Probability of an offset above which a single column counts as a gain: of nine arcs 5.1 deviations (6 leave more rings), of
+three 8.1."""
 
 LEAST_DRIFT = 0.5
 """Variance of slopes over time, over that of their errors, below which a drift is not subtracted. Scans without drift have up
 to 0.3, because their volume does not explain everything; a drift of 0.4 hardly raises the error of a volume."""
+
+LARGE_DRIFT = 5.0
+"""Deviations of a slope that count at most in the variance of all."""
 
 ROUNDING = 1e-10
 """Deviation of an offset by rounding, at least."""
@@ -116,20 +121,20 @@ def _share_of_gains(offsets: np.ndarray) -> np.ndarray:
     found, variances = np.mean(offsets, axis=0), np.var(offsets, axis=0, ddof=1) / len(offsets)
     excess = found**2 - variances
     by_chance = GAIN_DEVIATIONS * excess.std() / np.sqrt(len(excess))
-    return _share_above_chance(found, variances, excess.mean() if excess.mean() > by_chance else 0.0)
+    return _share_above_chance(found, variances, excess.mean() if excess.mean() > by_chance else 0.0, len(offsets))
 
 
-def _share_above_chance(found: np.ndarray, variances: np.ndarray, true: float) -> np.ndarray:
+def _share_above_chance(found: np.ndarray, variances: np.ndarray, true: float, arcs: int) -> np.ndarray:
     """Share of each pixel's value that is above its error (empirical Bayes).
 
     The best linear estimate of a true value is the found one times ``true / (true + error)``, with the variance of both.
 
-    A few faulty columns hardly raise the variance of all. So a column whose value exceeds ``COLUMN_DEVIATIONS`` of its own
-    deviations counts for itself.
+    A few faulty columns hardly raise the variance of all. So a column counts for itself if its value has a chance below
+    ``COLUMN_CHANCE`` by its own error.
 
     Args:
         found: (..., cols).
-        variances: variances of the errors, which are averaged over ``ERROR_COLUMNS``.
+        variances: variances of the errors, from ``arcs`` of the scan; they are averaged over ``ERROR_COLUMNS``.
         true: variance of the true values: the mean square of the found values less the mean of ``variances``; 0 if that is
             chance.
 
@@ -140,7 +145,7 @@ def _share_above_chance(found: np.ndarray, variances: np.ndarray, true: float) -
     # Arcs of a noiseless scan may agree to rounding.
     errors = np.maximum(uniform_filter1d(variances, ERROR_COLUMNS, mode="nearest"), ROUNDING**2)
     # Few arcs may agree by chance in a few neighbours: an error counts as at least the median of all.
-    is_own = squares > COLUMN_DEVIATIONS**2 * np.maximum(errors, np.median(variances))
+    is_own = squares > t.isf(COLUMN_CHANCE / 2, (arcs - 1) * ERROR_COLUMNS) ** 2 * np.maximum(errors, np.median(variances))
     own = np.where(is_own, 1 - errors / np.where(is_own, squares, 1), 0)
     return np.maximum(true / (true + errors), own)
 
@@ -164,11 +169,11 @@ def fit_drift_above_chance(residual: np.ndarray, weights: np.ndarray, times: np.
     def share(name: str) -> np.ndarray:
         variances = (arcs - 1) ** 2 / arcs * np.var([getattr(fit, name) for fit in fits], axis=0, ddof=1)
         found, error = getattr(drift, name), variances.mean()
-        # Single pixels count for themselves.
-        true = np.minimum(found**2, COLUMN_DEVIATIONS**2 * error).mean() - error
+        # Single pixels of large drift count for themselves.
+        true = np.minimum(found**2, LARGE_DRIFT**2 * error).mean() - error
         # The mean square of n normal numbers scatters by sqrt(2 / n) of their variance.
         least = max(LEAST_DRIFT, GAIN_DEVIATIONS * np.sqrt(2 / found.size)) * error
-        return _share_above_chance(found, variances, true if true > least else 0.0)
+        return _share_above_chance(found, variances, true if true > least else 0.0, arcs)
 
     slope = share("slope")
     # A constant offset alone is no drift: data.rings removes it.
@@ -193,7 +198,8 @@ def find_zingers(transmission: Transmission, threshold: float) -> np.ndarray:
 
     A pixel is compared with the median of the 3 x 3 pixels around it, and with the median of the same pixel in the views
     before and after: it must differ from both medians by ``threshold`` deviations, the same way. The deviation of a
-    difference is that of the noise, and at least the robust deviation of all differences in the view.
+    difference is that of the noise, and at least the robust deviation of all differences in the view, or of the pixel's bends
+    over time: details of the object pass by.
 
     Args:
         transmission: (views, rows, cols) with its variance.
@@ -209,7 +215,8 @@ def find_zingers(transmission: Transmission, threshold: float) -> np.ndarray:
     around, before = filled - median_filter(filled, size), filled - median_filter(filled, shape)
     scale = 1.4826 * np.median(np.abs(around), axis=(1, 2), keepdims=True)
     far = around / np.maximum(np.maximum(noise, scale), 1e-12)
-    near = before / np.maximum(noise, 1e-12)
+    bends = 1.4826 * np.median(np.abs(np.diff(filled, 2, axis=0)), axis=0) / 2 if len(value) >= 3 else 0.0
+    near = before / np.maximum(np.maximum(noise, bends), 1e-12)
     jumps = (np.abs(far) > threshold) & (np.abs(near) > threshold) & (far * near > 0)
     hot = np.mean(np.abs(far) > threshold, axis=0) > HOT_SHARE
     return seen & (jumps | hot)

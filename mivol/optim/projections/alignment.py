@@ -71,8 +71,11 @@ COMMON_STEPS, LARGEST_COMMON = np.array([0.25, 4e-3, 4e-3]), np.array([2.0, 0.05
 """Half the difference for a derivative, and the largest step: axis [pixel], tilts along the light and across it [rad]."""
 
 CLEAR, LEAST_GAIN, TINY = 4.0, 0.1, 1e-30
-"""Standard errors, and logarithm of the ratio, by which the squared residual of held-out views must fall: their own three moves
-alone lower it by some percent. Residuals below the last number count as it."""
+"""Standard errors, and logarithm of the ratio, by which the squared residual of held-out views must fall beyond what their own
+moves explain of noise. Residuals below the last number count as it."""
+
+MOST_BY_CHANCE = 0.9
+"""Largest share of noise that the moves of a view are said to explain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +126,8 @@ def align_views(
     """Fit where the detector stood.
 
     Held-out views take no part in the volume. Their own moves are fitted to its prediction, and the mean squared residual of
-    this prediction judges the result: a geometry that lowers it by less than ``CLEAR`` standard errors and a tenth is not used.
+    this prediction judges the result. A geometry is used if it lowers this residual by a tenth, and by ``CLEAR`` standard
+    errors more than own moves lower it by chance, because they explain a part of the noise.
 
     Args:
         beam: the nominal geometry.
@@ -171,10 +175,12 @@ def align_views(
         _misfit(at.beam(small), coarse, smooth, mask, judges) for at in (_State(0 * state.moves, 0 * state.common), state)
     )
     better = np.log(np.maximum(before, TINY) / np.maximum(after, TINY))
-    is_needed = better.mean() > max(CLEAR * better.std(ddof=1) / math.sqrt(len(better)), LEAST_GAIN)
-    sigma = np.zeros(3)
+    sigma, by_chance = np.zeros(3), np.zeros(len(y))
     if own:
-        spread = _moves_spread(_slopes(predicted)[..., own], mask, normal)
+        spread, by_chance = _moves_spread(_slopes(predicted)[..., own], mask, normal)
+    clear = CLEAR * better.std(ddof=1) / math.sqrt(len(better)) - np.log1p(-by_chance[judges]).mean()
+    is_needed = better.mean() > max(clear, LEAST_GAIN)
+    if own:
         sigma[own] = _deviations(float(after.mean()) * spread, np.array(steps)[..., own])
     moves, found = state.moves * [factor, factor, 1.0], state.common * [factor, 1.0, 1.0]
     shifted = _State(moves, found)
@@ -381,8 +387,9 @@ def _fix_gauge(moves: np.ndarray, angles: np.ndarray) -> np.ndarray:
     return fixed
 
 
-def _moves_spread(slopes: np.ndarray, mask: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Variances (own moves,) of a typical view (median) over the variance of its smooth readings.
+def _moves_spread(slopes: np.ndarray, mask: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Variances (own moves,) of a typical view (median) over the variance of its smooth readings; and the share (views,) of the
+    squares of smooth noise that moves explain, ``tr(N^-1 J^T G G^T J)`` over the trace of ``G G^T``.
 
     Args:
         slopes: J, derivatives of the readings by the moves (views, rows, cols, own moves).
@@ -391,8 +398,9 @@ def _moves_spread(slopes: np.ndarray, mask: np.ndarray, normal: np.ndarray) -> n
     """
     smooth = np.stack([_smooth(mask * part) for part in np.moveaxis(slopes, -1, 0)], -1)
     inverse = np.linalg.inv(normal)
-    covariance = inverse @ np.einsum("vrci,vrcj->vij", smooth, smooth) @ inverse / _smooth_variance(mask.shape)
-    return np.median(np.diagonal(covariance, axis1=1, axis2=2), axis=0)
+    pulls = inverse @ np.einsum("vrci,vrcj->vij", smooth, smooth) / _smooth_variance(mask.shape)
+    shares = np.trace(pulls, axis1=1, axis2=2) / np.maximum(mask.sum((1, 2)), 1.0)
+    return np.median(np.diagonal(pulls @ inverse, axis1=1, axis2=2), axis=0), np.minimum(shares, MOST_BY_CHANCE)
 
 
 def _deviations(variances: np.ndarray, steps: np.ndarray) -> np.ndarray:
