@@ -188,7 +188,9 @@ class MapReading:
             return MapReading()
         params = traverse(emitter)
         data, placed = params["data"], params["to_world"].matrix
-        if dr.grad_enabled(data):
+        with dr.resume_grad():  # images suspend gradients, and then nothing seems to have any
+            is_differentiated = dr.grad_enabled(data)
+        if is_differentiated:
             return MapReading()
         held, box = (dr.detach(data), dr.detach(placed)), scene.bbox()
         # Mitsuba's ball of a scene without shapes has no numbers.
