@@ -70,11 +70,11 @@ def read_media_light(
 
 
 MAX_MOVED = 0.1
-"""Share of the light that may move to other cells, and way of a box over its edge, for which a predicted gain is kept [1]."""
+"""Largest share of the light in other cells, and largest way of a box over its edge, for which a predicted gain is kept [1]."""
 
 
 def _is_alike(table: EmissionTable, density: mi.Float, places: Sequence[Box]) -> bool:
-    """Whether a table has hardly changed from another one, which is given by its density and the places of its boxes."""
+    """Whether a table has hardly changed from an earlier table, given by density and places of boxes."""
     boxes = [each.box for each in table.boxes]
     way = max(np.abs(now.corners() - old.corners()).max() / old.edge for now, old in zip(boxes, places, strict=True))
     volumes = [dr.full(mi.Float, each.cell_volume, CELLS_PER_AXIS**3) for each in table.boxes]
@@ -100,7 +100,7 @@ def find_emitting_boxes(media: SceneMedia, boundaries: Sequence[Boundary]) -> li
 
 
 def find_light_place(view: MediumView, around: np.ndarray) -> np.ndarray:
-    """The smallest box around the light of a medium: its boundary ``around``, or a grid."""
+    """The smallest box around the light of a medium: the boundary ``around``, or a grid."""
     return min([*_emission_boxes(view), around], key=lambda m: abs(np.linalg.det(m[:3, :3])))
 
 

@@ -106,7 +106,7 @@ def find_needs(
 
 
 def locate_light(needs: Needs, scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey) -> Needs:
-    """The facts, which have views of the media, with the light that media emit."""
+    """The facts, with views of the media and with the light of the media."""
     scatters = needs.surfaces or any(m.is_scattering for m in needs.media)
     refused = any(m.bounded or m.has_own_walk for m in needs.media)
     if is_recording() or refused or not (scatters and any(m.emits for m in needs.media)):

@@ -293,7 +293,7 @@ def is_scattering(view: MediumView, survey: SceneSurvey, name: str) -> bool:
 
 
 def read_number(value: float | mi.Float, survey: SceneSurvey) -> float:
-    """A number, or the number of an array of one, read once for each array: the host waits for all kernels before it reads."""
+    """A number, read once from an array of length 1: the host waits for all kernels before it reads."""
     if isinstance(value, float):
         return value
     if value.state == dr.VarState.Literal:

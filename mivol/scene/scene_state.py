@@ -107,7 +107,7 @@ class SceneState:
         return self.sensor is other.sensor and self.values == other.values and self.others == other.others
 
     def has_same_rest(self, other: SceneState) -> bool:
-        """Whether nothing differs but values that a recording follows, and the sensor."""
+        """Whether the states differ at most in the sensor and in values followed by a recording."""
         return self.others[:-1] == other.others[:-1]
 
     def has_same_numbers(self, other: SceneState) -> bool:
@@ -196,7 +196,7 @@ def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:
 
 
 def list_fixed_numbers(scene: mi.Scene) -> list[str]:
-    """Keys of the numbers of BSDFs that are part of Mitsuba's kernels, such as a refractive index."""
+    """Keys of BSDF numbers inside Mitsuba's kernels, for example a refractive index."""
     params = traverse(scene)
     numbers = ((key, params.properties[key][2], value) for key, value in list_values(params))
     return [key for key, owner, value in numbers if isinstance(owner, mi.BSDF) and isinstance(value, float)]

@@ -78,8 +78,8 @@ class _SurveyedScene:
         is_joined: whether the scene and its tracer share their arrays.
         sources: the objects of whose parameters plugins compute values, by pointer; None before the first gradient.
         opened: the plans for images (True) and for derivatives (False).
-        stand_ins: sensors with their stand-ins, by pointer and facts. With the sensor: another one could get its pointer.
-        views: of the last image, for its derivatives; kept longer, they would keep the derivatives of an earlier step.
+        stand_ins: sensors with their stand-ins, by pointer and facts. A freed sensor could leave its pointer to another sensor.
+        views: of the last image, for its derivatives; views kept longer would keep the derivatives of an earlier step.
         map: the bright part of the environment map.
         number: tells the recordings of scenes apart.
     """
@@ -109,7 +109,7 @@ OUT_OF_MEMORY = "out of memory"
 """Words of Dr.Jit's error when the system or the GPU has no more memory."""
 
 MAX_SCENES = 2
-"""Most scenes of which a session keeps plans and recordings, such as one to fit and one to judge by."""
+"""Most scenes whose plans and recordings a session keeps, for example a scene to fit and a scene to judge by."""
 
 MAX_RECORDINGS = 256
 """Largest number of recordings: an image and a gradient from each of 128 cameras."""
@@ -269,7 +269,7 @@ class Session:
         return self._surveyed.opened
 
     def _turn_to(self, parts: list[mi.Object]) -> bool:
-        """Make the scene of these shapes and emitters the one of the present render; false for an unknown scene."""
+        """Choose the scene of these shapes and emitters for the present render; false for an unknown scene."""
         self._scenes.sort(key=lambda one: one.is_of(parts))
         return bool(self._scenes) and self._surveyed.is_of(parts)
 
@@ -403,7 +403,7 @@ class Session:
         return self._find_unrecorded(opened, scene, for_images)
 
     def _read_bright_map(self, scene: mi.Scene, for_images: bool) -> BrightMap | None:
-        """Read the bright part of an environment map for images; returns None for derivatives."""
+        """Read the bright part of an environment map; returns None for derivatives."""
         if not for_images or is_recording():
             return None
         self._surveyed.map = self._surveyed.map.follow(scene)
@@ -446,7 +446,7 @@ class Session:
 
 
 def _read_table(needs: Needs) -> tuple[mi.Float, mi.Float64] | None:
-    """The table of the light of media; None without a table."""
+    """The table of the light of media, if the scene has a table."""
     return None if needs.media_light is None else (needs.media_light.density, needs.media_light.cumulative)
 
 

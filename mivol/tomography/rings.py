@@ -45,7 +45,7 @@ LEAST_DRIFT = 0.5
 to 0.3, because their volume does not explain everything; a drift of 0.4 hardly raises the error of a volume."""
 
 LARGE_DRIFT = 5.0
-"""Deviations of a slope that count at most in the variance of all."""
+"""Largest number of deviations of a slope in the variance of all slopes."""
 
 ROUNDING = 1e-10
 """Deviation of an offset by rounding, at least."""
@@ -125,7 +125,7 @@ def _share_of_gains(offsets: np.ndarray) -> np.ndarray:
 
 
 def _share_above_chance(found: np.ndarray, variances: np.ndarray, true: float, arcs: int) -> np.ndarray:
-    """Share of each pixel's value that is above its error (empirical Bayes).
+    """Share of each pixel's value above the error (empirical Bayes).
 
     The best linear estimate of a true value is the found one times ``true / (true + error)``, with the variance of both.
 

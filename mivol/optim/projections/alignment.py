@@ -127,7 +127,7 @@ def align_views(
 
     Held-out views take no part in the volume. Their own moves are fitted to its prediction, and the mean squared residual of
     this prediction judges the result. A geometry is used if it lowers this residual by a tenth, and by ``CLEAR`` standard
-    errors more than own moves lower it by chance, because they explain a part of the noise.
+    errors more than own moves lower the residual by chance, by explaining a part of the noise.
 
     Args:
         beam: the nominal geometry.

@@ -194,7 +194,7 @@ class LightFit(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class DriftFit:
-    """Offset and slope of each pixel, as far as they exceed chance; ``times`` preferably centred at 0."""
+    """Offset and slope of each pixel beyond chance; ``times`` preferably centred at 0."""
 
     times: np.ndarray
 

@@ -56,7 +56,7 @@ def integrate_optical_depth(
         medium: the medium around the origin of the ray.
         active: lanes to follow.
         enough: the ray may stop where its optical depth exceeds this number in every channel; None to follow it to the end.
-            If all media are homogeneous, the optical depth of boxes and balls is that up to ``ray.maxt``.
+            If all media are homogeneous, the optical depth of boxes and balls ends at ``ray.maxt``.
         passes_null: as of :func:`.ray_intervals.visit_media`.
 
     Returns:

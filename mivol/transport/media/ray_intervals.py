@@ -203,7 +203,7 @@ def _visit_around(
     state: Any,
     active: mi.Bool,
 ) -> Any:
-    """Visit the traced medium around the origin of a segment that stays in it."""
+    """Visit the traced medium around the origin of a segment inside of it."""
     for body in media.traced:
         on = active & (segment.medium == mi.MediumPtr(body.view.medium))
         state = visit(state, MediumInterval(segment.ray, mi.Float(0), segment.length, on, body))

@@ -74,7 +74,7 @@ MIN_LISTED = 1 << 14
 on from its own probes, since fewer kernels matter more there."""
 
 MAX_PLACES = 5
-"""Largest number of segments of a branch whose places of near light are kept for its replay."""
+"""Largest number of segments of a branch whose places of near light are kept for the replay."""
 
 MAX_SORTED_LENGTH = 0xFFF
 """Largest number of scattering events told apart when branches are sorted by length."""
@@ -320,7 +320,7 @@ class _ProbeList:
         d: directions of their flights.
         time: times of their rays.
         body: indices of their media.
-        gain: d loss / d light of each path, times the gain of its probe [length].
+        gain: d loss / d light of each path, times the gain of the probe [length].
         depth: number of scattering events before the probe.
         bits, state: random numbers (:class:`SpreadSampler`).
         counts: number of probes of first flights, at the beginning of the arrays, and of later flights, at their end (arrays of
@@ -359,7 +359,7 @@ class _ProbeList:
             dr.scatter(array, value, place, on)
 
     def add_derivatives(self, estimators: Estimators, wavelengths: mi.Color0f) -> None:
-        """Walk paths from the probes, and add the derivatives at them."""
+        """Walk paths from the probes, and add the derivatives of the probes."""
         media, n = estimators.media, dr.width(self.body)
         dr.eval(self)
         lane, (front, back) = dr.arange(mi.UInt32, n), self.counts

@@ -248,7 +248,7 @@ class Estimators:
         glass: what the first smooth glass of a camera ray does to it: "any" by chance, "transmits", or "mirrors"; the light of
             the last two adds up to that of the first.
         mirrored: guesses of the light in mirrors, for kept rays (:mod:`.kept_rays`); None to find lamps in mirrors by chance.
-        places: places of near light in memory, for walks and their replays (:class:`SegmentNumber`); None without them.
+        places: places of near light in memory, for walks and their replays (:class:`SegmentNumber`), or None.
         writes_places: walks write their places; replays read them.
         shows: emitters that the camera sees directly: "all", the "lamps" (emitters with a surface), or the "rest".
         media: media of the scene.

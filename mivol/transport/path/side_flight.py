@@ -53,8 +53,8 @@ AIMED_SHARE = 0.1
 0.07, 0.1, 0.15 and 0.25: 0.53, 0.50, 0.49 and 0.76 in a smoke of optical depth 20 with a mean cosine of 0.8 under a sun, and
 0.99, 1.02, 1.07 and 1.22 in a cloud of albedo 0.999.)
 
-A constant environment is the same in all directions, so aimed directions find nothing in it, and their weights are noise of its
-light. So the share falls with ``Estimators.even_share``."""
+A constant environment is the same in all directions. Aimed directions find nothing there, and their weights are noise of this
+light. Therefore the share falls with ``Estimators.even_share``."""
 
 
 @dataclass

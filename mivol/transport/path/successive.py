@@ -131,7 +131,7 @@ def walk_successively(
 
 
 def walk_from_points(estimators: Estimators, starts: PathStart, front: mi.UInt32, back: mi.UInt32) -> mi.Spectrum:
-    """Walk paths that begin by scattering at points of media, several in succession in each lane.
+    """Walk paths from scattering points of media, several in succession in each lane.
 
     Args:
         estimators: estimators of the render; their segments end in media.

@@ -93,18 +93,18 @@ by 1.1 times in a glass of milk, 1.3 times in a dense cloud, 1.6 to 1.7 times in
 
 @dataclass
 class SegmentNumber:
-    """The number of the next segment of a path in the memory of its places of near light.
+    """The number of the next segment of a path in the memory of places of near light.
 
     Attributes:
         index: index in memory.
-        left: number of segments that have room there.
+        left: number of segments for which the memory has room.
     """
 
     index: mi.UInt32
     left: mi.UInt32
 
     def after(self, stride: int, on: mi.Bool) -> SegmentNumber:
-        """The number after a segment, in lanes that have followed it."""
+        """The number after a followed segment, in the lanes that followed."""
         following, left = self.index + stride, dr.maximum(self.left, 1) - 1
         return SegmentNumber(dr.select(on, following, self.index), dr.select(on, left, self.left))
 
@@ -797,7 +797,7 @@ def _start_reservoirs(estimators: Estimators, path: Path, *probes: str) -> Path:
 
 
 def _end_path(estimators: Estimators, path: Path) -> Path:
-    """Add the derivatives along the kept shadow ray, and its light in images, at the end of a path; thin its probes."""
+    """Add the light of the kept shadow ray in images, or its derivatives, at the end of a path; thin the probes."""
     for kept in (path.tabulated, path.mirror):
         if kept is not None:
             path.score = path.score.add(TrackedTerm(kept.light_at_camera(estimators.media, path.ray), mi.Bool(True)))

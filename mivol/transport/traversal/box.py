@@ -107,7 +107,8 @@ class Box:
 
 MAX_TILT = 1e-12
 """Largest entry of a map to an upright box beside its diagonal, over the largest of all [1]. Fits of upright cubes leave 1e-14
-by rounding. Float32 vertices know faces to 6e-8 of their distance from the origin, and this tilt moves them by 1e-12 of it."""
+by rounding. Float32 vertices know faces to 6e-8 of their distance from the origin, and this tilt moves
+them by 1e-12 of the distance."""
 
 
 _PLACEMENTS: ContextVar[tuple[mi.Float64, dict[bytes, int], mi.UInt32] | None] = ContextVar("placements", default=None)

@@ -2,11 +2,11 @@ r"""The bright part of an environment map, for emitter samples.
 
 .. math:: p(\omega) \propto \max( L(\omega) - c\,\bar L,\; 0 )
 
-Sampled directions of BSDFs and phase functions meet an even light without noise. So emitter samples draw only the radiance L
-above a share c of its mean (MIS compensation). Sampled directions alone find the light where this density is 0.
+Sampled directions of BSDFs and phase functions meet an even light without noise. Therefore emitter samples draw only the
+radiance L above a share c of the mean (MIS compensation). Sampled directions alone find the light where this density is 0.
 
 Conventions. As in Mitsuba's ``envmap``: rows from the pole +y down, the first and the last at the poles; columns around it,
-with the middle of the map at +z. Radiance is bilinear between the nodes of the map, and so is the density over the map.
+with the middle of the map at +z. Radiance and density are bilinear between the nodes of the map.
 
 References: Karlík et al. 2019 (MIS compensation).
 """
@@ -33,7 +33,7 @@ c = 0: 0.74 in a fog under a map of a museum, 0.62 on surfaces under this map. c
 c = 0.5.)"""
 
 MIN_SINE = 1e-6
-"""Smallest sine of the angle to a pole: the map divides by it."""
+"""Smallest sine of the angle to a pole, a divisor."""
 
 
 @dataclass
@@ -105,7 +105,7 @@ class BrightMap:
     def _choose_cell(self, u: mi.Point2f, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32, mi.Point2f]:
         """Choose a cell: its column and row, and two uniform numbers in [0, 1).
 
-        Each turn halves a block along both axes, so near numbers choose near cells. A choice of rows and then of
+        Each turn halves a block along both axes: near numbers choose near cells. A choice of rows and then of
         columns has 1.3 times the variance with spread samples on a floor under a map.
         """
         x_bits, y_bits = _count_halvings(self.rows - 1, self.columns)
@@ -130,14 +130,14 @@ class BrightMap:
         return [mi.Vector3f(*(dr.gather(mi.Float, self.to_world, mi.UInt32(3 * k + j)) for j in range(3))) for k in range(3)]
 
     def _corners(self, column: mi.UInt32, row: mi.UInt32, active: mi.Bool) -> list[mi.Float]:
-        """Density at the corners of a cell: two of its first row, and two of the next."""
+        """Density at the corners of a cell: two in the first row, and two in the next."""
         following = dr.select(column + 1 < self.columns, column + 1, 0)
         places = (j * self.columns + k for j in (row, row + 1) for k in (column, following))
         return [dr.gather(mi.Float, self.density, place, active) for place in places]
 
 
 def _count_halvings(rows: int, columns: int) -> tuple[int, int]:
-    """How often a square of cells is halved along x and along y. It is halved along x each time."""
+    """How often a square of cells is halved along x (each time) and along y."""
     y_bits = (rows - 1).bit_length()
     return max((columns - 1).bit_length(), y_bits, 1), y_bits
 
@@ -155,7 +155,7 @@ def _sum_blocks(cells: NDArray) -> NDArray:
 
 
 def _choose_half(one: mi.Float, other: mi.Float, u: mi.Float) -> tuple[mi.Bool, mi.Float]:
-    """Choose one of two by their weights and by ``u``: whether it is the other, and a uniform number in [0, 1)."""
+    """Choose between two weights by ``u``: whether the second is chosen, and a uniform number in [0, 1)."""
     chance = one / dr.maximum(one + other, 1e-37)
     is_other = u >= chance
     rest = dr.select(is_other, (u - chance) / dr.maximum(1 - chance, 1e-37), u / dr.maximum(chance, 1e-37))
@@ -163,13 +163,13 @@ def _choose_half(one: mi.Float, other: mi.Float, u: mi.Float) -> tuple[mi.Bool, 
 
 
 def _per_solid_angle(pdf: mi.Float, sine: mi.Float) -> mi.Float:
-    """A density over the unit square of a map as one over directions [1/sr]."""
+    """A density over directions [1/sr], from the density over the unit square of a map."""
     return pdf * dr.rcp(2 * dr.pi**2 * dr.maximum(sine, MIN_SINE))
 
 
 @dataclass
 class MapReading:
-    """The bright part of the map of a scene, and the arrays from which it was made, by which a change is noticed.
+    """The bright part of the map of a scene, and the arrays of this map, by which a change is noticed.
 
     Attributes:
         source: indices of the arrays in Dr.Jit, and the ball around the scene.

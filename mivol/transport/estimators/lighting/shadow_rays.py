@@ -67,7 +67,7 @@ def find_transmittance(
         active: lanes to follow.
         rng: state of the random number generator for an unbiased estimate: by tracking with block ranges or a bounded medium in
             the scene, by roulette otherwise; None means the exact transmittance.
-        ends_at_light: whether the light comes from ``ray.maxt``, so a surface in front makes the result of no use. Rays through
+        ends_at_light: whether the light comes from ``ray.maxt``, and a surface in front makes the result useless. Rays through
             dark homogeneous media are then not traced.
 
     Returns:

@@ -160,7 +160,7 @@ class NearLightPlace:
         t: distance on the ray [length].
         body: index of the medium.
         sigma_t: extinction [1/length].
-        reach: transmittance up to the point, over the density of its distance [length]; 0 without light.
+        reach: transmittance up to the point, over the density of this distance [length]; 0 without light.
         shadow: transmittance of the shadow ray, as in :class:`.DirectSample` [1].
     """
 
@@ -177,7 +177,7 @@ class NearLightPlace:
         return cls(*(dr.empty(kind, count) for kind in kinds))
 
     def at(self, index: mi.UInt32, active: mi.Bool) -> NearLightPlace:
-        """The places with an index; those of inactive lanes are without light."""
+        """The places with an index; places of inactive lanes are without light."""
         arrays = self.t, self.body, self.sigma_t, self.reach, self.shadow
         return NearLightPlace(*(dr.gather(type(a), a, index, active) for a in arrays))
 
@@ -237,7 +237,7 @@ class NearLighting:
 
     @property
     def has_places(self) -> bool:
-        """Whether a :class:`NearLightPlace` tells all that a walk finds: grids of one channel, and no tinted shadows."""
+        """Whether a :class:`NearLightPlace` holds all results of a walk: grids of one channel, and no tinted shadows."""
         media = self.media
         return media.channels == 1 and not (media.is_bounded or media.is_homogeneous or media.has_null_transmission)
 
@@ -297,7 +297,7 @@ class NearLighting:
             samples: its random numbers.
             attached: keep derivatives.
             active: lanes to follow.
-            known: the places found by an earlier walk of the same segments, and lanes in which they are known.
+            known: the places found by an earlier walk of the same segments, and the lanes with a known place.
         """
         media, ray = self.media, segment.ray
         everywhere = active & segment.may_scatter
