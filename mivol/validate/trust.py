@@ -37,6 +37,9 @@ NEAR_EMITTER = 0.1
 # the light, 0.014 to 0.03 times the square of reach / gap; a square at 2.4 times the reach loses nothing (0.002).
 LIMB_LOSS = 0.02
 
+ROUND = ("Sphere", "Cylinder")
+"""Classes of emitters with a limb. Boxes lose nothing that was noticed; whether a mesh is round is not asked."""
+
 TOUCH_POINTS = 512
 """Surface points tested for another boundary."""
 
@@ -235,18 +238,13 @@ def _near_emitter(shape: mi.Shape, b: MediumShape) -> Found:
             f"{reach / gap:.0f} times as large.",
             whole < 2 * reach,
         )
-    elif gap > 0 and (loss := LIMB_LOSS * (reach / gap) ** 2) > MIN_LOSS and not _is_flat(shape, far - near):
+    elif gap > 0 and (loss := LIMB_LOSS * (reach / gap) ** 2) > MIN_LOSS and shape.class_name() in ROUND:
         yield (
             f"the emitter {name} is {gap:.2g} from {b.name}: Mitsuba's shadow rays that leave a boundary and graze a curved "
             f"emitter end behind its surface, and are dark, about {loss:.1%} of its light; move it away, or allow for that "
             "much.",
             False,
         )
-
-
-def _is_flat(shape: mi.Shape, extent: np.ndarray) -> bool:
-    # A mesh is only seen to be flat along an axis.
-    return shape.class_name() in ("Rectangle", "Disk") or bool(extent.min() <= 1e-3 * extent.max())
 
 
 def _camera_inside(sensor: mi.Sensor, boundaries: list[MediumShape]) -> Iterator[str]:

@@ -69,7 +69,7 @@ segment, and each branch costs more. (Best k of scenes with lamps inside: 1.6 to
 USUAL_NOISE = 0.15
 """The noise of media without a baseline."""
 
-MIN_LISTED = 1 << 14
+MIN_LISTED = 1 << 15
 """Smallest number of rays in a pass whose probes are listed, and walk in a kernel of their own. In smaller passes a path walks
 on from its own probes, since fewer kernels matter more there."""
 
