@@ -70,8 +70,8 @@ USUAL_NOISE = 0.15
 """The noise of media without a baseline."""
 
 MIN_LISTED = 1 << 15
-"""Smallest number of rays in a pass whose probes are listed, and walk in a kernel of their own. In smaller passes a path walks
-on from its own probes, since fewer kernels matter more there."""
+"""Smallest number of rays in a pass whose probes are listed, and walk in a kernel of their own, and whose places of near light
+are kept. In smaller passes a path walks on from its own probes, since fewer kernels matter more there."""
 
 MAX_PLACES = 5
 """Largest number of segments of a branch whose places of near light are kept for the replay."""

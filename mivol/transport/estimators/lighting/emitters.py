@@ -98,7 +98,8 @@ class SceneEmitters:
         self._balls = [ball for e, ball in placed if e.class_name() != UNIFORM_EMITTER]
         self.is_near = any(ball is not None for ball in self._balls)
         self._from_camera = from_camera
-        self._bright, self._map = bright, next((e for e in self.sampled if e.is_environment()), None)
+        self._map = next((e for e in self.sampled if e.is_environment()), None)
+        self._bright = None if self._map is None else bright
         self._hiding = [e for e in self.sampled if resamples and _hides_sides(e)]
         # Dr.Jit records a call for every emitter of the scene, chosen or not.
         self.are_evaluated = all(e.class_name() != PARALLEL_AREA for e in scene.emitters())
@@ -213,7 +214,7 @@ class SceneEmitters:
         self, it: mi.Interaction3f, emitter: mi.EmitterPtr, u: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
         """Sample a direction towards an emitter: the sample, and the radiance over its density."""
-        if self._bright is None or self._map is None:
+        if self._bright is None:
             return emitter.sample_direction(it, u, active)
         if len(self.sampled) == 1:
             return self._bright.sample(it, emitter, u, active)
@@ -226,7 +227,7 @@ class SceneEmitters:
         """Lanes whose samples the balance heuristic weighs: samples of the bright part of a map. In a nearly even map the power
         heuristic has 1.1 times the variance.
         """
-        return False if self._bright is None or self._map is None else emitter == mi.EmitterPtr(self._map)
+        return False if self._bright is None else emitter == mi.EmitterPtr(self._map)
 
     def pdf_direction(self, it: mi.Interaction3f, direct: mi.DirectionSample3f, active: mi.Bool) -> mi.Float:
         """Density of a direction in :meth:`sample_direction` [1/sr]; 0 towards an emitter that is not sampled."""
@@ -240,7 +241,7 @@ class SceneEmitters:
         """Density of a direction towards an emitter [1/sr], times the probability of the emitter."""
         probability = distribution.probability(self._table.number(direct.emitter))
         active = active & (probability > 0)
-        if self._bright is None or self._map is None:
+        if self._bright is None:
             return direct.emitter.pdf_direction(it, direct, active) * probability
         is_map = active & (direct.emitter == mi.EmitterPtr(self._map))
         pdf = self._bright.pdf(direct.d, is_map)
