@@ -226,6 +226,7 @@ class Count:
     def __init__(self) -> None:
         self.chances: dict[int, float] = defaultdict(float)
         self.p_values: list[tuple[float, str]] = []
+        self.largest = (0.0, "")
         self.tests: set[str] = set()
         self.comparisons = 0
 
@@ -256,6 +257,7 @@ class Count:
                 self.comparisons += 1
                 self.chances[number] += chance
                 self.tests.add(report.nodeid)
+                self.largest = max(self.largest, (chance, report.nodeid))
                 self.p_values += [] if p is None else [(p, report.nodeid)]
 
     @property
@@ -276,6 +278,8 @@ class Count:
         line = f"{self.comparisons} comparisons of noise in {len(self.tests)} tests: a false alarm with a chance of at most "
         line += f"{self.most:.2g}{rounds} (aim: below {AIM:g})"
         terminalreporter.write_line(line, red=self.most > AIM)
+        if self.most > AIM:
+            terminalreporter.write_line("the largest chance is {:.2g}, of {}".format(*self.largest), red=True)
         if self.p_values:
             (p, test), k = min(self.p_values), len(self.p_values)
             chance = -np.expm1(k * np.log1p(-min(p, 1 - 1e-16)))

@@ -96,6 +96,7 @@ def test_a_run_that_is_red_too_often_by_chance_ends_red(tmp_path):
     code, said = outcome(tmp_path, "@noise\ndef test():\n    note(2e-5, 'a')")
     assert code == 1, said
     assert "1 passed" in said and "a chance of at most 2e-05" in said
+    assert "the largest chance is 2e-05, of " in said and "test_it.py::test" in said
 
 
 def test_a_mark_without_a_comparison_and_a_comparison_without_a_mark_are_red(tmp_path):
