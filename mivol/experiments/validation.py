@@ -247,9 +247,10 @@ def check_gradients(scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrato
 def check_gradient(
     scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator, key: str, settings: Validation, level: Significance
 ) -> Slope:
-    """Check one direction of one parameter: each value times a random number from 0 to 2, so that no step passes 0 and the
-    effects
-    of the values do not cancel."""
+    """Check one direction of one parameter: each value times a random number from 0 to 2.
+
+    So no step passes 0, and the effects of the values do not cancel.
+    """
     params = traverse(scene)
     start = np.array(as_tensor(params[key]), dtype=np.float64)
     direction = np.random.default_rng([settings.seed, len(key)]).uniform(0.0, 2.0, start.shape) * start

@@ -1,4 +1,4 @@
-"""Choices subject a scene: a function each, with the reason printed by ``explain``."""
+"""Choices about a scene: one function for each, with the reason that ``mivol explain`` prints."""
 
 from __future__ import annotations
 
@@ -64,10 +64,9 @@ Measured on 2 cores, efficiency (variance x time): smoke of 142 cells 0.4, smoke
 
 SCATTERING_POINTS = {(True, False): 4, (True, True): 8, (False, False): 2, (False, True): 2}
 """Scattering points per camera ray, by (grid is filled, all emitters have one position or direction). Walking a filled grid
-costs
-more, and a shadow ray to such an emitter less. Measured efficiency (variance x time) over 1 point: smoke 1.5 to 2, CT 1.5 to
-2.4; threads, whose noise comes from the pixel's own footprint, 1.0 to 1.2 with 2 points and 0.9 to 1.3 with 4. With 8 points
-over 4, point lights: smoke 1.1, CT 1.1 and 1.3."""
+costs more, and a shadow ray to such an emitter less. Measured efficiency (variance x time) over 1 point: smoke 1.5 to 2, CT
+1.5 to 2.4; threads, whose noise comes from the pixel's own footprint, 1.0 to 1.2 with 2 points and 0.9 to 1.3 with 4. With 8
+points over 4, point lights: smoke 1.1, CT 1.1 and 1.3."""
 
 LAMP_RAYS, LAMP_COST, MIN_LAMP_GAIN, MIN_LAMP_SAMPLES = (4, 8, 16), 0.05, 1.2, 1 << 15
 """Own camera rays a sample for lamps in view, the time of one over the time of a path (measured: 0.03 in a room of depth 10,
@@ -93,8 +92,7 @@ Measured for an event, with this time of a branch: jade 0.4, tissue 0.2, wax beh
 
 MIN_SIDE_FLIGHT_COSINE = 0.5
 """Mean cosine of a phase function above which side flights pay. Below, samples of the phase function find the light. Measured
-for
-Henyey-Greenstein with g = 0.8 under a sun: variance x time is 2 to 4 times smaller."""
+for Henyey-Greenstein with g = 0.8 under a sun: variance x time is 2 to 4 times smaller."""
 
 MIN_TABLE_NODES, MAX_TABLE_NODES, TABLE_SHARE = 8, 24, 1 / 32
 """Fewest and most nodes along an edge of a table of shadows, and most nodes for each sample of an image. Measured variance x

@@ -53,8 +53,7 @@ Kernels are added up in float64."""
 
 MIN_CELLS_PER_VOXEL = 16
 """Crossed cells per voxel of the grid above which empty blocks are located and values are copied with a margin: either reads
-each
-voxel a few times."""
+each voxel a few times."""
 
 MAX_ALONG = 0.2
 """Largest share of cells entered along an axis, on average, for the walk between columns along this axis: each such step is a

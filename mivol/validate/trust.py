@@ -261,8 +261,7 @@ def _camera_inside(sensor: mi.Sensor, boundaries: list[MediumShape]) -> Iterator
 
 FACE_TOLERANCE = 1e-4
 """Distance outside the unit cube that still counts as on its face: Mitsuba prints transforms with 6 digits, and float32
-vertices
-carry 1e-7 of their size."""
+vertices carry 1e-7 of their size."""
 
 RESTART_DISTANCE = 1500 * 2.0**-24
 """math::RayEpsilon of float32: Mitsuba restarts a ray at a surface point p by (1 + max|p|) times this distance behind the
