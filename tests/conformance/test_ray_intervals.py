@@ -15,8 +15,13 @@ import scenes
 from mivol.transport.estimators.flights.free_flight import FreeFlight
 from mivol.transport.estimators.scores import IMAGE
 from mivol.transport.estimators.segment import PathSegment
-from mivol.transport.media.optical_depth import integrate_optical_depth, segment_optical_depth, vjp_optical_depth
-from mivol.transport.media.ray_intervals import RaySegment
+from mivol.transport.media.optical_depth import (
+    integrate_optical_depth,
+    jvp_optical_depth,
+    segment_optical_depth,
+    vjp_optical_depth,
+)
+from mivol.transport.media.ray_intervals import RaySegment, draw_uniform_point
 from mivol.transport.traversal.random_numbers import seed_pcg32
 from scenes import ball_of, box_of, centred, media_of, medium, rotation
 
@@ -140,6 +145,22 @@ def test_optical_depths_of_homogeneous_media_follow_from_one_trace() -> None:
     vjp_optical_depth(media, segment, dr.full(mi.Spectrum, 1, 1), on)
     box, balls = (float(np.array(body.gradients[0]).sum()) for body in media.bodies)
     np.testing.assert_allclose([balls, box], [3 * 2 * CHORD, 3 * 1], rtol=1e-5)
+
+
+def test_derivatives_by_the_medium_of_a_box_trace_no_boundary() -> None:
+    """Only the box is differentiated: the boundaries of the balls are not traced again, along the ray or for a point of it."""
+    media, on = media_of(row_of_fogs()), mi.Bool([True])
+    segment = RaySegment(along_the_row(1), dr.zeros(mi.MediumPtr, 1), mi.Float(7))
+    media.scene = media.tracer = None
+    box, balls = media.bodies
+    balls.follows = [False]
+    media.start_gradients()
+    vjp_optical_depth(media, segment, dr.full(mi.Spectrum, 1, 1), on)
+    assert [float(np.array(body.gradients[0]).sum()) for body in (box, balls)] == pytest.approx([3, 0], rel=1e-5)
+    box.has_tangent, box.tangents, balls.has_tangent, balls.tangents = [True], [mi.Float(4)], [False], [None]
+    np.testing.assert_allclose(np.array(jvp_optical_depth(media, segment, on)), 4, rtol=1e-5)
+    point = draw_uniform_point(media, segment, [box], mi.Float(0.25), on)
+    assert [float(point.t[0]), float(point.length[0])] == pytest.approx([5.75, 1], rel=1e-5)
 
 
 @pytest.mark.statistical

@@ -131,6 +131,11 @@ class Body:
         return any(self.follows) or is_followed(self.view.microflakes)
 
     @property
+    def has_tangents(self) -> bool:
+        """Whether some part, or the microflakes, have a tangent in a forward pass."""
+        return any(self.has_tangent) or self.microflakes_tangent is not None
+
+    @property
     def needs_probes(self) -> bool:
         """Whether points besides collisions must estimate derivatives: by an extinction that may be thin, or a low albedo."""
         return (self.follows_extinction and not self.is_thick) or (self.follows_albedo and self.has_low_albedo)

@@ -117,15 +117,15 @@ def vjp_rows(
 
     if not media.follows_extinction:
         return
-    bounded = bounded_parts(media.bodies)
+    followed = [body for body in media.bodies if body.follows_extinction]
+    bounded = bounded_parts(followed)
 
     def visit(points: list[PointReservoir], interval: MediumInterval) -> list[PointReservoir]:
         interval.body.vjp_optical_depth(interval, weight(interval.body) if callable(weight) else weight)
         return _pass(points, bounded, interval)
 
-    points = revisit_media(
-        media, segment, visit, start_reservoirs(len(bounded), segment.u, dr.width(segment.ray)), active, True
-    )
+    start = start_reservoirs(len(bounded), segment.u, dr.width(segment.ray))
+    points = revisit_media(media, segment, visit, start, active, True, followed)
     for (body, part), point in zip(bounded, points, strict=True):
         # After the walk: Dr.Jit loses what is differentiated in a loop with respect to an array that already has a gradient.
         rows = weight(body) if callable(weight) else weight
@@ -141,7 +141,8 @@ def jvp_optical_depth(media: SceneMedia, segment: RaySegment, active: mi.Bool) -
 def jvp_rows(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> list[mi.Float]:
     """Like :func:`jvp_optical_depth`, with a number for each channel."""
 
-    bounded, zero = bounded_parts(media.bodies), [mi.Float(0) for _ in range(media.channels)]
+    followed = [body for body in media.bodies if body.has_tangents]
+    bounded, zero = bounded_parts(followed), [mi.Float(0) for _ in range(media.channels)]
 
     def visit(state: tuple, interval: MediumInterval) -> tuple:
         tau, points = state
@@ -149,7 +150,7 @@ def jvp_rows(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> list[mi
         return [t + d for t, d in zip(tau, own, strict=True)], _pass(points, bounded, interval)
 
     start = (zero, start_reservoirs(len(bounded), segment.u, dr.width(segment.ray)))
-    tau, points = revisit_media(media, segment, visit, start, active, anywhere=True)
+    tau, points = revisit_media(media, segment, visit, start, active, True, followed)
     for (body, part), point in zip(bounded, points, strict=True):
         on = active & (point.total > 0)
         rows = body.jvp_extinction_at(segment.ray, point.t, media.channels, on, part.name)

@@ -186,7 +186,7 @@ def visit_media(
         for interval in find_boxed_intervals(media, ray, ray.maxt, active):
             state = visit(state, interval)
     if knows_medium:
-        state = _visit_around(media, RaySegment(ray, medium, ray.maxt), visit, state, active)
+        state = _visit_around(media.traced, RaySegment(ray, medium, ray.maxt), visit, state, active)
     trace = _visit_nothing if knows_medium else visit
     end, state = trace_boundaries(media, ray, medium, trace, state, active, passes_null, reach)
     if homogeneous:
@@ -197,14 +197,14 @@ def visit_media(
 
 
 def _visit_around(
-    media: SceneMedia,
+    traced: list[Body],
     segment: RaySegment,
     visit: Callable[[Any, MediumInterval], Any],
     state: Any,
     active: mi.Bool,
 ) -> Any:
-    """Visit the traced medium around the origin of a segment inside of it."""
-    for body in media.traced:
+    """Visit that of some traced media which lies around the origin of a segment inside of it."""
+    for body in traced:
         on = active & (segment.medium == mi.MediumPtr(body.view.medium))
         state = visit(state, MediumInterval(segment.ray, mi.Float(0), segment.length, on, body))
     return state
@@ -221,6 +221,7 @@ def revisit_media(
     state: Any,
     active: mi.Bool,
     anywhere: bool = False,
+    among: list[Body] | None = None,
 ) -> Any:
     """Visit the media of a segment of known length; only boundaries that are no boxes and let rays pass are traced again.
 
@@ -229,17 +230,29 @@ def revisit_media(
         segment: the segment.
         anywhere: whether ``visit`` depends only on the length of an interval in a homogeneous medium, not on its place. With
             known ``passages``, no boundary is traced then.
+        among: the media to visit; by default all. If all of them fill boxes, no boundary is traced.
     """
+    among = media.bodies if among is None else among
+    traced = [body for body in media.traced if _holds(among, body)]
     if anywhere and segment.passages is not None:
         for body, length in zip(media.traced, segment.passages, strict=True):
-            state = visit(state, MediumInterval(segment.ray, mi.Float(0), length, active & (length > 0), body))
-    elif media.stops_rays:
-        state = _visit_around(media, segment, visit, state, active)
-    elif media.traced:
-        return visit_media(media, segment.ray, segment.medium, visit, state, active, segment.passes_null)[1]
-    for interval in find_boxed_intervals(media, segment.ray, segment.length, active):
+            if _holds(among, body):
+                state = visit(state, MediumInterval(segment.ray, mi.Float(0), length, active & (length > 0), body))
+    elif traced and media.stops_rays:
+        state = _visit_around(traced, segment, visit, state, active)
+    elif traced:
+
+        def visit_some(state: Any, interval: MediumInterval) -> Any:
+            return visit(state, interval) if _holds(among, interval.body) else state
+
+        return visit_media(media, segment.ray, segment.medium, visit_some, state, active, segment.passes_null)[1]
+    for interval in find_boxed_intervals(media, segment.ray, segment.length, active, among):
         state = visit(state, interval)
     return state
+
+
+def _holds(bodies: list[Body], body: Body) -> bool:
+    return any(other is body for other in bodies)
 
 
 def find_end(media: SceneMedia, ray: Ray, medium: mi.MediumPtr, active: mi.Bool) -> SegmentEnd:
@@ -247,7 +260,9 @@ def find_end(media: SceneMedia, ray: Ray, medium: mi.MediumPtr, active: mi.Bool)
     return trace_boundaries(media, ray, medium, _visit_nothing, (), active, False)[0]
 
 
-def find_boxed_intervals(media: SceneMedia, ray: Ray, t_end: mi.Float, active: mi.Bool) -> list[MediumInterval]:
+def find_boxed_intervals(
+    media: SceneMedia, ray: Ray, t_end: mi.Float, active: mi.Bool, among: list[Body] | None = None
+) -> list[MediumInterval]:
     """Find the intervals of the media in boxes between the origin of the ray and ``t_end``.
 
     Args:
@@ -255,13 +270,14 @@ def find_boxed_intervals(media: SceneMedia, ray: Ray, t_end: mi.Float, active: m
         ray: world space, unit direction.
         t_end: end of the ray [length]; may be infinite.
         active: lanes to clip.
+        among: as in :func:`revisit_media`.
 
     Returns:
         An interval for each of ``media.boxed``, in their order; two intervals for a medium with a hole, before and behind the
         hole.
     """
     intervals = []
-    for body in media.boxed:
+    for body in media.boxed if among is None else (b for b in media.boxed if _holds(among, b)):
         t0, t1 = mi.Float64(0), mi.Float64(t_end)
         if body.cuts_grids:
             t0, t1 = body.clip(ray, t0, t1)
@@ -293,7 +309,7 @@ def trace_boundaries(
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
     si.wi, si.wavelengths, si.time = -ray.d, ray.wavelengths, ray.time
     if dr.hint(not media.traces, mode="scalar"):
-        state = _visit_around(media, RaySegment(ray, medium, ray.maxt), visit, state, active)
+        state = _visit_around(media.traced, RaySegment(ray, medium, ray.maxt), visit, state, active)
         return SegmentEnd(si, mi.Float(ray.maxt), medium, 1.0), state
     is_shadow_ray = passes_null
     passes_null &= media.has_null_transmission
@@ -477,8 +493,6 @@ def draw_uniform_point(media: SceneMedia, passed: RaySegment, among: list[Body],
 
     def visit(state: tuple, interval: MediumInterval) -> tuple:
         point, index = state
-        if not any(interval.body is body for body in among):
-            return state
         begin, end = interval.inside()
         on = interval.active & (end > begin) & (end < ENDLESS)
         point, kept = offer_interval(point, mi.Float(dr.select(on, begin, 0)), mi.Float(dr.select(on, end, 0)), on)
@@ -487,5 +501,5 @@ def draw_uniform_point(media: SceneMedia, passed: RaySegment, among: list[Body],
 
     zero = dr.zeros(mi.Float, width)
     start = (PointReservoir(zero, zero, zero, u + zero), dr.zeros(mi.UInt32, width))
-    point, body = revisit_media(media, passed, visit, start, active)
+    point, body = revisit_media(media, passed, visit, start, active, among=among)
     return UniformPoint(mi.Float64(point.t), point.total, body, active & (point.total > 0))
