@@ -165,7 +165,7 @@ def test_a_replay_reads_where_the_walk_has_found_near_light(name: str, monkeypat
     (lamp, key, most), found = LAMPS[name], []
     monkeypatch.setattr(derivatives, "MIN_LISTED", 1)
     for places in (0, most):
-        monkeypatch.setattr(derivatives, "MAX_PLACES", places)
+        monkeypatch.setattr(derivatives, "MAX_SEGMENTS", places)
         found.append(gradient_of_mean_image(lit_inside(lamp), key, 64, fresh(3)))
     # 4096 float32 terms of both signs.
     np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-5 * np.abs(found[0]).max())

@@ -89,11 +89,14 @@ class KnownFlight:
         t: distance of the collision on the ray [length]; infinite without a collision.
         body: index of its medium.
         on: lanes in which the collision is known.
+        meets_no_surface: lanes in which no surface lies in front of the collision, or on the whole ray without a collision, so
+            nothing is traced; None if unknown.
     """
 
     t: mi.Float64
     body: mi.UInt32
     on: mi.Bool
+    meets_no_surface: mi.Bool | None = None
 
     def at(self, index: mi.UInt32, active: mi.Bool) -> KnownFlight:
         """The flights of other lanes, known where ``active``."""

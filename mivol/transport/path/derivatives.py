@@ -31,15 +31,14 @@ from mivol.transport.estimators.flights.baseline import Baseline, BaselineSums
 from mivol.transport.estimators.flights.flight_derivatives import Probe, ProbeTerm
 from mivol.transport.estimators.scores import Factor, Replay, Rest, Tangent
 from mivol.transport.estimators.segment import KnownFlight, SegmentTransmittance
-from mivol.transport.estimators.single_scattering.near_light import NearLightPlace
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays
+from mivol.transport.path.kept_segments import KeptSegments, SegmentNumber
 from mivol.transport.path.successive import walk_from_points
 from mivol.transport.path.walk import (
     Path,
     PathStart,
-    SegmentNumber,
     add_probes,
     leave_camera_from_memory,
     walk_from_camera,
@@ -70,11 +69,11 @@ USUAL_NOISE = 0.15
 """The noise of media without a baseline."""
 
 MIN_LISTED = 1 << 15
-"""Smallest number of rays in a pass whose probes are listed, and walk in a kernel of their own, and whose places of near light
-are kept. In smaller passes a path walks on from its own probes, since fewer kernels matter more there."""
+"""Smallest number of rays in a pass whose probes are listed, and walk in a kernel of their own, and whose segments are kept. In
+smaller passes a path walks on from its own probes, since fewer kernels matter more there."""
 
-MAX_PLACES = 5
-"""Largest number of segments of a branch whose places of near light are kept for the replay."""
+MAX_SEGMENTS = 5
+"""Largest number of segments of a stem or branch that are kept in memory for the replay."""
 
 MAX_SORTED_LENGTH = 0xFFF
 """Largest number of scattering events told apart when branches are sorted by length."""
@@ -117,13 +116,12 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
     """
     first, replayed = rays.sampler.clone(), estimators.replayed()
     start = leave_camera_from_memory(estimators, rays.sampler, rays.ray)
-    n, rooms = dr.width(start.ray), _count_places(estimators)
+    n, (stem_rooms, rooms) = dr.width(start.ray), _count_segments(estimators)
     if n >= MIN_LISTED and rooms > 0:
-        places = NearLightPlace.empty((rooms + 1) * n)
-        dr.eval(places)
-        estimators = replace(estimators, places=places)
-        replayed = replace(replayed, places=places, writes_places=True)
-        start.number = SegmentNumber(dr.arange(mi.UInt32, n), dr.full(mi.UInt32, 1, n))
+        kept = _make_kept_segments(estimators, (stem_rooms + rooms) * n)
+        estimators = replace(estimators, kept=kept)
+        replayed = replace(replayed, kept=kept, writes_segments=True)
+        start.number = SegmentNumber(dr.arange(mi.UInt32, n), dr.full(mi.UInt32, stem_rooms, n))
         dr.make_opaque(start.number)
 
     # -- The radiance of stems and branches ------------------------------------------------------------------------------
@@ -131,7 +129,7 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
     dr.schedule(dL)
     branching = _Branching.of(estimators, stems, first)
     if start.number is not None:
-        branching.rooms = rooms
+        branching.stem_rooms, branching.rooms = stem_rooms, rooms
     _, branches = branching.gather(dr.arange(mi.UInt32, n))
     L, _, path = walk_light(replayed, branches.in_memory(), stops=False)
     lengths = _Lengths.of(path.depth)
@@ -160,11 +158,29 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
         listed.add_derivatives(estimators, start.ray.wavelengths)
 
 
-def _count_places(estimators: Estimators) -> int:
-    """The number of segments of a branch whose places of near light are worth keeping."""
-    if estimators.near is None or not estimators.near.has_places:
-        return 0
-    return min(MAX_PLACES, max(0, estimators.settings.depth_limit - 2))
+def _count_segments(estimators: Estimators) -> tuple[int, int]:
+    """The numbers of segments of a stem and of a branch that are worth keeping; 0 if replays find all of them again."""
+    media = estimators.media
+    if media.is_bounded:
+        # A tracked flight leaves random numbers behind for its derivative.
+        return 0, 0
+    rooms = min(MAX_SEGMENTS, max(0, estimators.settings.depth_limit - 1))
+    return rooms if media.has_surfaces else min(rooms, 1), rooms
+
+
+def _make_kept_segments(estimators: Estimators, count: int) -> KeptSegments:
+    """Memory for segments, with all that replays of these media can read."""
+    media, near = estimators.media, estimators.near
+    needs_boundaries = any(body.follows_extinction or body.needs_probes for body in media.traced)
+    needs_boundaries |= bool(media.traced) and media.channels > 1
+    return KeptSegments.empty(
+        count,
+        # One number holds the shadow.
+        keeps_shadows=media.channels == 1 and not media.has_null_transmission,
+        keeps_places=near is not None and near.has_places,
+        # Near light and Gaussians shine up to the surface behind a collision.
+        skips_boundaries=not (needs_boundaries or near is not None or any(body.view.shows_gaussians for body in media.bodies)),
+    )
 
 
 def carry_tangents(estimators: Estimators, rays: CameraRays) -> mi.Spectrum:
@@ -220,7 +236,7 @@ class _Branching:
         place: place of each stem with a collision in ``collided``.
         count: number of these stems (an array of one number).
         each: branches of a stem (an array of one number).
-        rooms: segments of a branch whose places of near light are in memory, behind those of stems.
+        stem_rooms, rooms: segments of a stem and of a branch in memory: branches behind stems. 0 without memory.
     """
 
     start: PathStart
@@ -228,6 +244,7 @@ class _Branching:
     place: mi.UInt32
     count: mi.UInt32
     each: mi.UInt32
+    stem_rooms: int = 0
     rooms: int = 0
 
     @classmethod
@@ -263,7 +280,7 @@ class _Branching:
         start.sampler = start.sampler.branch(number % self.each, self.each)
         if self.rooms:
             n = dr.width(number)
-            start.number = SegmentNumber(number + n, dr.full(mi.UInt32, self.rooms, n))
+            start.number = SegmentNumber(number + self.stem_rooms * n, dr.full(mi.UInt32, self.rooms, n))
         return stem, start
 
     def add_light(self, stems: mi.Spectrum, branches: mi.Spectrum) -> mi.Spectrum:

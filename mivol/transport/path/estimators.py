@@ -17,12 +17,13 @@ from mivol.transport.estimators.lighting.emission_sampling import EmissionSampli
 from mivol.transport.estimators.lighting.kept_rays import KeptMirror, KeptRay, MirroredEmitters
 from mivol.transport.estimators.lighting.tabulated_shadows import KeptShadow, TransmittanceGrid
 from mivol.transport.estimators.segment import Absorption, SegmentEstimator, TrackedAbsorption
-from mivol.transport.estimators.single_scattering.near_light import NearLighting, NearLightPlace
+from mivol.transport.estimators.single_scattering.near_light import NearLighting
 from mivol.transport.estimators.single_scattering.scattering_quadrature import ScatteringQuadrature
 from mivol.transport.estimators.single_scattering.single_scattering import SingleScattering
 from mivol.transport.estimators.single_scattering.visibility_cache import VisibilityCache
 from mivol.transport.line_integrals.emission import Emission
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.path.kept_segments import KeptSegments
 
 __all__ = [
     "SEGMENT_ESTIMATORS",
@@ -248,8 +249,8 @@ class Estimators:
         glass: what the first smooth glass of a camera ray does to it: "any" by chance, "transmits", or "mirrors"; the light of
             the last two adds up to that of the first.
         mirrored: guesses of the light in mirrors, for kept rays (:mod:`.kept_rays`); None to find lamps in mirrors by chance.
-        places: places of near light in memory, for walks and their replays (:class:`SegmentNumber`), or None.
-        writes_places: walks write their places; replays read them.
+        kept: what walks find along their segments, in memory for replays (:mod:`.kept_segments`); None without memory.
+        writes_segments: walks write to this memory; replays read it.
         shows: emitters that the camera sees directly: "all", the "lamps" (emitters with a surface), or the "rest".
         media: media of the scene.
         draws_shadows: shadow rays of vertices are estimated, by tracking or by roulette, with a random number.
@@ -266,8 +267,8 @@ class Estimators:
     near: NearLighting | None = None
     mirrored: MirroredEmitters | None = None
     shows: str = "all"
-    places: NearLightPlace | None = None
-    writes_places: bool = False
+    kept: KeptSegments | None = None
+    writes_segments: bool = False
     camera_emission: mi.Float | float = 1.0
     glass: str = "any"
     even_share: mi.Float | float = 0.0

@@ -42,6 +42,7 @@ from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.extinction import to_components
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.event import DirectionSamples, PathEvent, is_glass, mirror_ray, sample_next_direction
+from mivol.transport.path.kept_segments import SegmentNumber
 from mivol.transport.path.side_flight import (
     SideFlightSamples,
     WeightedEmitterSample,
@@ -92,24 +93,6 @@ by 1.1 times in a glass of milk, 1.3 times in a dense cloud, 1.6 to 1.7 times in
 
 
 @dataclass
-class SegmentNumber:
-    """The number of the next segment of a path in the memory of places of near light.
-
-    Attributes:
-        index: index in memory.
-        left: number of segments for which the memory has room.
-    """
-
-    index: mi.UInt32
-    left: mi.UInt32
-
-    def after(self, stride: int, on: mi.Bool) -> SegmentNumber:
-        """The number after a followed segment, in the lanes that followed."""
-        following, left = self.index + stride, dr.maximum(self.left, 1) - 1
-        return SegmentNumber(dr.select(on, following, self.index), dr.select(on, left, self.left))
-
-
-@dataclass
 class Path:
     """The state of a path.
 
@@ -139,7 +122,7 @@ class Path:
         mirror: kept ray mirrored by glass; None if mirrored paths find lamps by chance.
         mirrored: lanes mirrored by the last event, with the mirrored ray offered to ``mirror``; None without ``mirror``.
         met_glass: lanes that have met smooth glass; None if chance decides what glass does (``Estimators.glass``).
-        number: number of the next segment among those whose places of near light are in memory; None without them.
+        number: number of the next segment among the segments in memory (:mod:`.kept_segments`); None without memory.
     """
 
     ray: FineRay
@@ -494,6 +477,11 @@ def _follow_segment(estimators: Estimators, path: Path) -> tuple[Path, PathEvent
     segment.needs_surface = estimators.near is not None
     if path.known is not None:
         segment.known, path.known = path.known, path.known.forget()
+    number, stored = path.number, None
+    if number is not None:
+        stored = path.active & (number.left > 0)
+        if not estimators.writes_segments:
+            segment.known = estimators.kept.flight_at(number.index, stored, segment.known)
     if estimators.emission is not None:
         segment.emission_weight = estimators.emission.weigh_path(path.last, path.emission_pdf, path.ray.d, path.active)
     if not (isinstance(estimators.camera_emission, float) and estimators.camera_emission == 1):
@@ -503,7 +491,11 @@ def _follow_segment(estimators: Estimators, path: Path) -> tuple[Path, PathEvent
     if estimate.light is not None:
         path.score = path.score.add(estimate.light)
     if estimators.near is not None:
-        path = _add_near_light(estimators, path, segment, estimate.end.t)
+        path = _add_near_light(estimators, path, segment, estimate.end.t, stored)
+    if number is not None:
+        if estimators.writes_segments:
+            estimators.kept.set_flight(number.index, estimate, stored)
+        path.number = number.after(dr.width(path.ray), path.active)
     path.score = path.score.scale(estimate.transmittance)
     if estimate.probe is not None:
         path.probes = path.probes.offer(segment, estimate.probe, estimate.chance)
@@ -655,7 +647,15 @@ def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_
     else:
         sample = _sample_far_emitter(estimators, vertex.interaction, event, sampler.next_2d(lit), lit)
     rng = draw_state(sampler, lit) if estimators.draws_shadows else None
-    direct = estimators.direct.estimate_at_vertex(vertex, sample, attached, lit, rng)
+    known, number = None, path.number
+    if number is not None and not estimators.writes_segments:
+        known = estimators.kept.shadow_at(number.index, lit & (number.left > 0))
+    direct = estimators.direct.estimate_at_vertex(vertex, sample, attached, lit, rng, known)
+    if known is not None:
+        # The lengths in media of a ray that is not followed are unknown.
+        direct.ray_segment.passages = None
+    if number is not None and estimators.writes_segments:
+        estimators.kept.set_shadow(number.index, direct.T, lit & (number.left > 0))
     with dr.resume_grad(when=attached):
         weight = mi.Spectrum(1)
         if event.collision is not None:
@@ -688,19 +688,18 @@ def _sample_far_emitter(
     return dr.select(event.in_medium, sample, at_surface)
 
 
-def _add_near_light(estimators: Estimators, path: Path, segment: PathSegment, length: mi.Float) -> Path:
-    """Add the light of near emitters scattered along a segment."""
-    attached = path.score.purpose != IMAGE
-    on, number, known = path.active & segment.may_scatter, path.number, None
+def _add_near_light(estimators: Estimators, path: Path, segment: PathSegment, length: mi.Float, stored: mi.Bool | None) -> Path:
+    """Add the light of near emitters scattered along a segment; ``stored``: lanes whose segment has room in memory, or None."""
+    attached, places = path.score.purpose != IMAGE, None
+    on, known = path.active & segment.may_scatter, None
     samples = estimators.near.draw(path.sampler, on)
-    if number is not None:
-        stored = on & (number.left > 0)
-        if not estimators.writes_places:
-            known = estimators.places.at(number.index, stored), stored
-        path.number = number.after(dr.width(path.ray), on)
+    if stored is not None:
+        places, stored = estimators.kept.places, stored & on
+    if places is not None and not estimators.writes_segments:
+        known = places.at(path.number.index, stored), stored
     near = estimators.near.estimate(segment, length, samples, attached, path.active, known)
-    if number is not None and estimators.writes_places:
-        estimators.places.set(number.index, near.place, stored)
+    if places is not None and estimators.writes_segments:
+        places.set(path.number.index, near.place, stored)
     path.score = path.score.add(near.light)
     if path.tabulated is not None:
         path.tabulated = path.tabulated.offer(near.tabulated, near.chance, near.shadow.active)
@@ -793,6 +792,8 @@ def _start_reservoirs(estimators: Estimators, path: Path, *probes: str) -> Path:
         path.probes = Probes(*(Probe.empty(path.ray) if name in probes else None for name in ("first", "later")))
     if "later" in probes and estimators.media.follows_extinction:
         path.shadow = ShadowReservoir.empty(estimators.media, path.ray)
+        if path.number is not None and not estimators.writes_segments and estimators.kept.shadow is not None:
+            path.shadow.ray_segment.passages = None
     return path
 
 

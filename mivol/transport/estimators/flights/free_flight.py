@@ -30,7 +30,7 @@ track-length estimator).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import drjit as dr
@@ -451,7 +451,11 @@ def _find_first_collision(
     start = _Flight(dr.full(mi.Float64, dr.inf, width), dr.zeros(mi.UInt32, width), u, rng, start_passages(media, width))
     if known is not None:
         start.t, start.body = dr.select(known.on, known.t, start.t), dr.select(known.on, known.body, start.body)
-    return visit_media(media, ray, medium, visit, start, active, reach=(lambda flight: flight.t) if stops else None)
+    traced = active
+    if known is not None and known.meets_no_surface is not None:
+        traced = active & ~known.meets_no_surface
+    end, flight = visit_media(media, ray, medium, visit, start, traced, reach=(lambda flight: flight.t) if stops else None)
+    return replace(end, t=dr.select(active & ~traced, ray.maxt, end.t)), flight
 
 
 def _uses_delta_tracking(part: Extinction) -> bool:
