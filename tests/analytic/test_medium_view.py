@@ -43,6 +43,14 @@ def test_cells_are_those_of_the_extinction_and_else_of_the_light():
     assert view(ConstantExtinction("sigma_a", mi.Float(1)), *grids, emission_lattice=light).walked_lattice is grids[0].lattice
 
 
+def test_cells_of_the_light_are_those_of_its_density_and_else_the_finest():
+    """A colour of finer cells does not make the cells of the density finer."""
+    coarse, fine = (grid_volume("mivol_voxels", np.ones((3 * k, 4 * k, 5 * k, 1), np.float32)) for k in (1, 2))
+    light = {"type": "mivol_medium", "sigma_t": 1.0, "albedo": coarse, "emission": fine}
+    assert view_medium(mi.load_dict(light)).emission_lattice.res == (6, 8, 10)
+    assert view_medium(mi.load_dict(light | {"emission_density": coarse})).emission_lattice.res == (3, 4, 5)
+
+
 def test_a_stock_grid_holds_the_points_of_its_box():
     """[-1, 3] x [-2, 2] x [-3, 1]; a volume that tests its own box holds every point."""
     box, ours = SimpleNamespace(ptr=7), SimpleNamespace(ptr=8)

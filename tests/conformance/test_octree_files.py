@@ -108,6 +108,10 @@ def test_colours_of_a_sigmoid_become_clamped_ones(variant_rgb: str) -> None:
     constant = 0.28209479
     old, new = (np.maximum(0.5 + constant * t.values()[1][:, 0], 0) for t in (tree, back))
     np.testing.assert_allclose(new, np.clip(old, 1 / 512, 511 / 512), atol=1e-5)
+    # A grid has no sigmoid, and takes the clamped colours.
+    found, expected = there.to_grid(), back.to_grid()
+    assert found.offset == expected.offset
+    np.testing.assert_array_equal(found.values()[1], expected.values()[1])
 
 
 def test_a_grid_of_an_octree_has_its_values_at_the_middles(variant_rgb: str, tmp_path: Path) -> None:

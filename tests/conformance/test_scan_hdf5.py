@@ -116,12 +116,13 @@ def test_the_first_of_several_scans_is_read(tmp_path: Path) -> None:
 
 
 def test_darks_and_angles_of_data_exchange_may_be_missing(tmp_path: Path) -> None:
-    """Without darks 0 is no light, without angles the arc is the settings'; flats are needed."""
+    """Without darks one frame of 0 is no light, without angles the arc is the settings'; flats are needed."""
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:
         file["exchange/data"], file["exchange/data_white"] = FRAMES[VIEWS], FRAMES[FLATS]
     scan = read_projections(path)
-    assert scan.angles is None and not scan.darks.any() and scan.notes == (NO_DARKS,)
+    assert scan.angles is None and scan.notes == (NO_DARKS,)
+    np.testing.assert_array_equal(scan.darks, np.zeros_like(FRAMES[:1]))
     with h5py.File(path, "a") as file:
         del file["exchange/data_white"]
     assert_refused("no flat", read_projections, path)
@@ -140,7 +141,7 @@ def test_datasets_by_name(tmp_path: Path) -> None:
         cut = getattr(read_projections(path, names=names, rows=slice(1, 2)), part)
         np.testing.assert_array_equal(cut, getattr(scan, part)[:, 1:2])
     scan = read_projections(path, names=names | {"darks": ""})
-    assert not scan.darks.any() and scan.notes == ("no darks: a reading of 0 is taken as no light",)
+    assert scan.darks.shape == (1, *FRAMES.shape[1:]) and scan.notes == ("no darks: a reading of 0 is taken as no light",)
     other = {"flats": "b.he5:before/background"}
     np.testing.assert_array_equal(read_projections(write_nxtomo(tmp_path / "a.nxs"), names=other).flats, FRAMES[DARKS])
 

@@ -82,6 +82,7 @@ def test_a_frustum_stands_in_its_camera_and_flies_there() -> None:
         assert handle.fov == pytest.approx(np.pi / 2) and handle.aspect == 2
         # viser divides the volume of 2, 1 and 1 by 3 and takes the third root: two thirds of the depth cubed.
         assert handle.scale == pytest.approx(frusta.frustum_size(photos) * (2 / 3) ** (1 / 3))
+        assert (handle.thickness, handle.thickness_units) == (1.5, "screen")
         assert np.abs(handle.wxyz) == pytest.approx([0, 1, 0, 0])
         assert np.array_equal(handle.position, frame.camera.origin)
         handle.call(SimpleNamespace(client="page"))

@@ -143,7 +143,7 @@ class GaussianPlan:
 
     def learning_rates(self, step: int, extent: float) -> dict[str, float]:
         """Learning rates in a step, by parameter."""
-        share = step / max(self.steps, 1)
+        share = step / self.steps
         factor = self.final_rate**share
         position_rate = self.position_rate * (self.final_position_rate / self.position_rate) ** share * extent
         return {

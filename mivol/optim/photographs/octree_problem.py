@@ -86,7 +86,7 @@ class LeafPlan:
 
     def learning_rates(self, step: int) -> tuple[float, float]:
         """Learning rates in a step: of extinctions times the edge of a cell, and of coefficients."""
-        fall = self.last ** (step / max(self.steps, 1))
+        fall = self.last ** (step / self.steps)
         return self.density_rate * fall, self.sh_rate * fall
 
 

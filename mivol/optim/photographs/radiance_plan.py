@@ -213,7 +213,7 @@ class RadiancePlan:
 
     def learning_rates(self, step: int) -> tuple[float, float]:
         """Learning rates in a step: of the density times half the longest edge, and of coefficients."""
-        share = step / max(self.steps, 1)
+        share = step / self.steps
         rise = 1.0
         if self.delay > 0:
             rise = 0.01 + 0.99 * math.sin(math.pi / 2 * min(share / self.delay, 1))
