@@ -15,7 +15,7 @@ from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.photos.camera_path import HomeView
 from mivol.view import page as module
-from mivol.view.page import FRAMES_A_SECOND, READ_ONLY, Page, cookie_name, find_fault, serve
+from mivol.view.page import FRAMES_A_SECOND, READ_ONLY, Page, cookie_name, find_fault
 from mivol.view.subjects import Look
 from mivol.view.transfer import COLOUR_MAPS, Transfer
 
@@ -315,16 +315,3 @@ def test_viser_is_asked_for(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
 @pytest.mark.parametrize("port", [0, 70_000])
 def test_ports_that_no_server_has_are_refused(port: int) -> None:
     assert_refused("expected 1 to 65535", module.start_server, port, TOKEN)
-
-
-def test_files_are_looked_at_about_once_a_second() -> None:
-    """Steps of a quarter of a second, for four seconds; the server is closed at the end."""
-    now, done = [0.0], []
-    page = SimpleNamespace(
-        painter=SimpleNamespace(clock=lambda: now[0]),
-        step=lambda: now.append(now.pop() + 0.25),
-        refresh=lambda: done.append(now[0]),
-        stop=lambda: done.append("stop"),
-    )
-    serve(page, lambda: now[0] >= 4)
-    assert done == [1.25, 2.5, 3.75, "stop"]
