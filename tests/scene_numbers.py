@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 import mitsuba as mi
 import numpy as np
+
+NUMBERS = re.compile(r"[-+.e\d\s]+(,[-+.e\d\s]+)+")
+"""Numbers with commas between them, as a scene file has them."""
 
 
 def numbers_of(value: object, name: str = "") -> Iterator[tuple[str, np.ndarray]]:
@@ -19,7 +23,7 @@ def numbers_of(value: object, name: str = "") -> Iterator[tuple[str, np.ndarray]
     elif isinstance(value, mi.ScalarTransform4f):
         yield name, np.array(value.matrix, dtype=np.float64)
     elif isinstance(value, str):
-        yield (name, np.array(value.split(","), dtype=np.float64)) if "," in value else (value, np.ones(1))
+        yield (name, np.array(value.split(","), dtype=np.float64)) if NUMBERS.fullmatch(value) else (value, np.ones(1))
     elif value is not None:
         yield name, np.atleast_1d(np.array(value, dtype=np.float64))
 

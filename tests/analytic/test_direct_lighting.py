@@ -174,6 +174,7 @@ def test_a_sample_at_infinity_is_the_same_from_everywhere(kind):
     for name in ("d", "pdf", "delta", "uv"):
         np.testing.assert_array_equal(np.array(getattr(moved.direct, name)), np.array(getattr(drawn.direct, name)))
     np.testing.assert_array_equal(np.array(moved.weight), np.array(drawn.weight))
+    assert dr.all(mi.Bool(moved.has_alternative) == mi.Bool(drawn.has_alternative))
     ahead = np.array(moved.direct.p - near.p) / np.array(moved.direct.dist)
     np.testing.assert_allclose(ahead, np.array(drawn.direct.d), rtol=0, atol=4 * ROUNDING)
     box = media.scene.bbox()

@@ -1,11 +1,13 @@
-"""What studies arrange before they measure: scenes, clouds, views and settings, as when the published figures were made."""
+"""What studies arrange before they measure, as when the published figures were made, and their answers of made-up times."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -13,12 +15,15 @@ import pytest
 from PIL import Image
 from scene_numbers import numbers_of
 
+from mivol.bench.harness.contests import Timing
+from mivol.bench.scenes import Extinction
 from mivol.bench.studies import (
     cluster,
     cluster_kills,
     conversions,
     depth,
     media_light,
+    optical_depth,
     points,
     representations,
     sparse,
@@ -28,6 +33,9 @@ from mivol.bench.studies import (
 from mivol.bench.studies.gradients import tutorial
 from mivol.bench.studies.radiance_field import contestants
 from mivol.files import read_volume
+from mivol.optim.gaussians import gaussian_plan
+from mivol.optim.photographs import radiance_plan, sampled_problem
+from mivol.optim.photographs.octree_problem import LeafPlan
 from mivol.points import read_gaussians
 
 
@@ -71,25 +79,41 @@ def arrange_settings(folder: Path) -> list:
     return [[[fit.sigma_t, fit.rates] for fit in fits], models, conversions.list_sources(conversions.ConversionSize())]
 
 
+def arrange_plans(folder: Path) -> list:
+    """The presets that fits begin with."""
+    presets = gaussian_plan.PRESETS, radiance_plan.PRESETS, *sampled_problem.PRESETS.values()
+    plans = [LeafPlan(100), *(plan for named in presets for plan in named.values())]
+    return [{name: each for name, each in asdict(plan).items() if not isinstance(each, type)} for plan in plans]
+
+
 def arrange_tiny_fits(folder: Path) -> list:
     photos = [[photo.image, photo.alpha, photo.camera.to_world] for photo in steps._photograph_cloud()]
     return [steps._draw_places(9, 1), photos]
 
 
 ARRANGEMENTS: dict[str, tuple[Callable[[Path], object], float]] = {
-    "clouds of Gaussians": (arrange_clouds, -16.337897),
-    "sparse fit": (arrange_sparse_fit, 12.957139),
-    "photographs of kills": (arrange_photographs_of_kills, 5.7412125),
-    "workloads": (arrange_workloads, 6371.2385),
-    "subjects of the viewer": (arrange_subjects, 26.5633),
-    "settings": (arrange_settings, -38.660892),
-    "tiny fits": (arrange_tiny_fits, -16.166854),
-    "cubes": (lambda folder: [depth.make_cube(*kind, 0.5, 2.0) for kind in depth.TABLES], -5.4978862),
-    "media that emit": (lambda folder: [media_light.make_scene(name, 8) for name in ("fire", "fog", "room")], 54.258493),
-    "tutorial": (lambda folder: tutorial.tutorial_scene(mi.TensorXf(np.ones((2, 2, 2, 1)))), 1.3530463),
-    "fog": (lambda folder: contestants.make_fog(contestants.FieldSize.quick())[0].density, 11.18664),
+    "clouds of Gaussians": (arrange_clouds, -36.0922162),
+    "sparse fit": (arrange_sparse_fit, 48.3591594),
+    "photographs of kills": (arrange_photographs_of_kills, 19.5740119),
+    "workloads": (arrange_workloads, 16.9040942),
+    "subjects of the viewer": (arrange_subjects, 116.971472),
+    "settings": (arrange_settings, -3.4204918),
+    "plans of fits": (arrange_plans, -85.9905014),
+    "tiny fits": (arrange_tiny_fits, -59.4630654),
+    "cubes": (lambda folder: [depth.make_cube(*kind, 0.5, 2.0) for kind in depth.TABLES], -29.4280929),
+    "media that emit": (lambda folder: [media_light.make_scene(name, 8) for name in ("fire", "fog", "room")], 166.266753),
+    "tutorial": (lambda folder: tutorial.tutorial_scene(mi.TensorXf(np.ones((2, 2, 2, 1)))), 32.1874398),
+    "fog": (lambda folder: contestants.make_fog(contestants.FieldSize.quick())[0].density, 14.2311516),
 }
 """Function of each arrangement, and the sum of all its numbers, each times a weight of its place."""
+
+
+def add_up(answer: object) -> tuple[float, float]:
+    """The sum of all numbers, each times a weight of its place, and how far another processor, which rounds float32 in other
+    ways, may be from it. On a scale of logarithms, so that rates do not hide ratios."""
+    found = np.concatenate([np.ravel(numbers) for _, numbers in numbers_of(answer)])
+    found = np.arcsinh(100 * np.nan_to_num(found, posinf=1e6))
+    return float(found @ np.cos(np.arange(found.size))), 1e-6 * float(np.abs(found).sum())
 
 
 @pytest.mark.parametrize("name", ARRANGEMENTS)
@@ -98,6 +122,57 @@ def test_arrangements(name: str, variant_rgb: str, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(mi, "load_dict", lambda scene: scene)
     monkeypatch.setattr(mi, "render", lambda scene, **options: np.full((2, 2, 3), options["spp"] + options["seed"]))
     arrange, expected = ARRANGEMENTS[name]
-    found = np.concatenate([np.ravel(numbers) for _, numbers in numbers_of(arrange(tmp_path))])
-    # Float32 is rounded otherwise by another processor.
-    assert found @ np.cos(np.arange(found.size)) == pytest.approx(expected, abs=1e-6 * np.abs(found).sum())
+    total, tolerance = add_up(arrange(tmp_path))
+    assert total == pytest.approx(expected, abs=tolerance)
+
+
+WALK, CLOUD = optical_depth.OpticalDepthSize.quick(), points.PointsSize("quick", clouds=((40, 8),), peer=(30, 8), walk_side=16)
+SMOKE = Extinction(np.linspace(0, 2, 60, dtype=np.float32).reshape(3, 4, 5), "made up")
+
+MEASURED: dict[str, tuple[Callable[[], object], float]] = {
+    "clouds": (lambda: points.measure_clouds(CLOUD), 18.8076134),
+    "peer of clouds": (lambda: points.measure_peer(CLOUD), -7.02326162),
+    "rays through clouds": (lambda: points.measure_rays(CLOUD), -7.45853598),
+    "walk": (lambda: optical_depth.measure_walk(WALK), 45.4695887),
+    "reverse": (lambda: optical_depth.measure_reverse(WALK), 65.2800749),
+    "image": (lambda: optical_depth.measure_image(WALK), -10.5387001),
+    "peers of walks": (lambda: optical_depth.measure_peers(WALK), 2.18059234),
+}
+"""Function of each answer, and the sum of all its numbers, each times a weight of its place."""
+
+
+@pytest.mark.parametrize("name", MEASURED)
+def test_answers_of_made_up_times(name: str, variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three rounds of each contestant, of which none is called; their results are ramps."""
+
+    def race(contestants: dict, rounds: int, keep: bool = False) -> dict[str, Timing]:
+        ramp = np.linspace(0.1, 0.9, 64 * 64 * 4).reshape(64, 64, 4)
+        results = [np.ravel(ramp)[: 64 * 64] * k if name == "peers of walks" else ramp * k for k in (1, 3, 4)]
+        return {
+            key: Timing(
+                {"seconds": 0.5 * k}, [k + 1.0, k + 2.0, k * k + 4.0], [2.0 * k, k + 3.0, 7.0], [k * r for r in results]
+            )
+            for k, key in enumerate(contestants, 1)
+        }
+
+    load_dict, unbuilt = mi.load_dict, ("scene", "mivol", "volpath")
+    monkeypatch.setattr(mi, "load_dict", lambda parts: SimpleNamespace() if parts["type"] in unbuilt else load_dict(parts))
+    for study in (optical_depth, points):
+        monkeypatch.setattr(study, "race", race)
+    monkeypatch.setattr(mi, "traverse", lambda scene: SimpleNamespace(properties={}))
+    monkeypatch.setattr(points, "reference_walk", lambda side: None)
+    monkeypatch.setattr(optical_depth, "ParameterGradient", lambda *given: None)
+    monkeypatch.setattr(optical_depth, "smoke", lambda: SMOKE)
+    monkeypatch.setattr(optical_depth, "ct_scan", lambda res: SMOKE)
+    answer, expected = MEASURED[name]
+    total, tolerance = add_up(answer())
+    assert total == pytest.approx(expected, abs=tolerance)
+
+
+def test_workers_of_a_study_have_a_demo(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a folder of their own, which is gone afterwards."""
+    monkeypatch.setattr(cluster, "choose_back_end", lambda variant, threads: None)
+    monkeypatch.setattr(cluster, "open_pool", lambda address, **options: nullcontext((address, options["threads"])))
+    with cluster.two_workers() as (pool, folder):
+        assert pool == ("local:2", 1) and (folder / "scene.xml").is_file()
+    assert not folder.exists()

@@ -8,6 +8,7 @@ import logging
 import multiprocessing
 import zlib
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,7 +21,8 @@ from tiny_experiment import refused, write_experiment
 
 from mivol import config
 from mivol.bench.studies.cluster import Network, Workload, best_workers, say_limit, step_seconds
-from mivol.cluster import distribution
+from mivol.cli import cluster as verbs
+from mivol.cluster import distribution, packages, reference
 from mivol.cluster.address import ClusterSettings, is_loopback, parse_cluster
 from mivol.cluster.connection import _collect_failures, _connect, _connect_address, import_distributed
 from mivol.cluster.distribution import ClusterDistribution, make_blocks
@@ -44,6 +46,7 @@ from mivol.experiments.scan_fit import ScanFit
 from mivol.experiments.scene_fit import SceneFit
 from mivol.optim.scenes.views import View
 from mivol.report.page import SweepRow
+from mivol.scene import explain
 from mivol.scene.load import load_scene
 from mivol.validate.reference import prepare_reference, render_reference
 
@@ -426,6 +429,30 @@ def test_sums_in_float64_do_not_depend_on_their_order() -> None:
     numbers = (rng.normal(size=(64, 100)) * 2.0 ** rng.integers(-10, 10, size=(64, 100))).astype(np.float32)
     sums = [numbers[order].astype(np.float64).sum(axis=0) for order in (rng.permutation(64) for _ in range(5))]
     assert all(np.array_equal(sums[0], other) for other in sums)
+
+
+@pytest.mark.parametrize("work", [verbs.complete_references, verbs.render_passes, verbs.validate_on_workers])
+def test_work_goes_to_the_workers_of_the_flag(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, work: Callable) -> None:
+    """Without the flag none are opened."""
+    opened: list[tuple[str, str, int]] = []
+    monkeypatch.setattr(verbs, "open_workers", lambda *given: opened.append(given) or nullcontext("pool"))
+    monkeypatch.setattr(packages, "share_scene", lambda pool, source, loaded: (pool, source.path, loaded.scene))
+    monkeypatch.setattr(explain, "describe_light", lambda scene, depth: {"max_depth": depth})
+    for name in ("complete_on", "passes_on"):
+        monkeypatch.setattr(reference, name, lambda pool, scene, *more, name=name: (name, pool, scene))
+    path = tmp_path / "a.xml"
+    given = {"mode": "llvm_ad_rgb", "threads": 2, "output": tmp_path, "sensor": 0, "integrator": {}}
+    given |= {"scene": path, "a": "", "define": []}
+    more = (7,) if work is verbs.validate_on_workers else ()
+    with work(SimpleNamespace(**given, cluster=None), SimpleNamespace(scene="smoke"), *more):
+        assert opened == []
+    with work(SimpleNamespace(**given, cluster="local:2"), SimpleNamespace(scene="smoke"), *more) as found:
+        complete, passes = ((name, "pool", ("pool", path, "smoke")) for name in ("complete_on", "passes_on"))
+        if more:
+            assert found["complete"] == complete and found["make_passes"]("own") == passes
+        else:
+            assert found == (complete if work is verbs.complete_references else passes)
+    assert opened == [("local:2", "llvm_ad_rgb", 2)]
 
 
 def test_images_of_points_are_refused_before_workers_start(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -83,7 +83,7 @@ BAD: dict[str, tuple[str, Callable[[], bytes], tuple[str, ...]]] = {
     "npy rank 2": ("a.npy", lambda: npy(ONE[0, :, :, 0]), ("shape (3, 4)", "(Z, Y, X)")),
     "npy rank 5": ("a.npy", lambda: npy(ONE[None]), ("shape (1, 2, 3, 4, 1)",)),
     "npy empty": ("a.npy", lambda: npy(ONE[:0]), ("empty array",)),
-    "npy beyond float32": ("a.npy", lambda: npy(np.full((2, 2, 2), 1e300)), ("1e+300 at voxel (z=0", "float32")),
+    "npy beyond float32": ("a.npy", lambda: npy(np.diag([0, 0, 1e300])[None]), ("1e+300 at voxel (z=0, y=2, x=2", "float32")),
     "npz cut": ("a.npz", lambda: npz(values=ONE)[:-30], ("damaged archive",)),
     "npz damaged member": ("a.npz", lambda: swapped(npz(values=ONE), b"NUMPY", b"NUMPX"), ("damaged",)),
     "npz several": ("a.npz", lambda: npz(a=ONE, b=ONE), ("2 arrays ('a', 'b')", "dataset=")),
@@ -383,7 +383,7 @@ EXCHANGE: dict[str, tuple[dict, tuple[str, ...]]] = {
     "rank": ({"data": np.ones((4, 6))}, ("shape (4, 6)",)),
     "projection Inf": ({"data": np.where(np.arange(24) == 23, np.inf, 0).reshape(4, 2, 3)}, ("inf in data at (3, 1, 2)",)),
     "flat NaN": ({"data_white": np.where(np.arange(12) == 5, np.nan, 1).reshape(2, 2, 3)}, ("nan in data_white at (0, 1, 2)",)),
-    "NaN": ({"data_dark": np.full((1, 2, 3), np.nan)}, ("nan in data_dark at (0, 0, 0)",)),
+    "NaN": ({"data_dark": np.array([[[0, 0, 0], [0, 0, np.nan]]])}, ("nan in data_dark at (0, 1, 2)",)),
 }
 
 

@@ -86,6 +86,7 @@ def test_distances_that_are_assumed(tmp_path: Path) -> None:
         ({"DistanceSourceToPatient": None}, 'views without DistanceSourceToPatient.*beam = "cone"'),
         ({"ImagerPixelSpacing": None}, "views without ImagerPixelSpacing"),
         ({"PositionerSecondaryAngle": 20.0}, "leans by 20 degrees"),
+        ({"PositionerSecondaryAngleIncrement": [0.0, 0, 3, 0, 0]}, "leans by 3 degrees"),
         ({"DistanceSourceToPatient": 95.0}, "95 mm from source to axis, 90 to the detector"),
         ({"PositionerPrimaryAngleIncrement": [0.0, 1.0]}, "2 numbers of PositionerPrimaryAngleIncrement.*5 frames"),
         ({"PixelIntensityRelationship": "LOG"}, "PixelIntensityRelationship LOG, expected values in proportion"),

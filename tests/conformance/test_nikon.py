@@ -93,9 +93,12 @@ def test_a_bead_is_projected_as_in_the_laboratory(tmp_path: Path, tilt: float, r
 
 
 def test_images_are_flipped(tmp_path: Path) -> None:
-    """A unique reading in each pixel: the first row and column of the file are the last of the detector."""
+    """A unique reading in each pixel: the first row and column of the file are the last of the detector. The saturation itself
+    is saturated."""
     counts = 1000.0 + np.arange(VIEWS * ROWS * COLUMNS).reshape(VIEWS, ROWS, COLUMNS)
-    found = read_nikon_transmission(read_nikon(write_scan(tmp_path, counts)))
+    scan = read_nikon(write_scan(tmp_path, counts))
+    found = read_nikon_transmission(scan)
+    np.testing.assert_array_equal(np.isnan(read_nikon_transmission(scan, 1500.0)), counts[:, ::-1, ::-1] >= 1500)
     for row in range(ROWS):
         for column in range(COLUMNS):
             stored = counts[:, ROWS - 1 - row, COLUMNS - 1 - column]
