@@ -29,7 +29,7 @@ from mivol.transport.path import derivatives
 from mivol.transport.path.derivatives import count_baseline_paths, count_branches, prepare_derivatives
 from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.walk import Path, PathStart, walk_part
-from scenes import ball_of, box_of, camera, grid_volume, medium, skip_recorded_grids_on_a_gpu, sky
+from scenes import ball_of, box_of, camera, centred, grid_volume, medium, skip_recorded_grids_on_a_gpu, sky
 
 MEDIUM = "smoke.interior_medium."
 KEYS = {
@@ -117,14 +117,17 @@ def replays(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, np.ndarray, np.n
 def test_a_replay_finds_the_light_that_was_found(name: str, replays: list) -> None:
     """Replayed branches, in another order, leave only rounding; replayed stems leave the mean light of their branches."""
     gradient_of_mean_image(SCENES[name](), KEYS["density"], 16, fresh(3), depth=7)
-    (first, whole, left, _), (second, light, rest, _) = replays
+    (first, whole, left, dL), (second, light, rest, scaled) = replays
     assert (first, second) == ("stems", "branches")
     assert len(np.unique(light[0])) > 100
     # Some 20 terms of a path are subtracted one by one.
     assert np.abs(rest).max() <= 20 * 2**-24 * np.abs(light).max()
     assert np.count_nonzero(left.sum(axis=0) > 20 * 2**-24 * whole.max()) > 100
-    k = 1 if name in ("rgb", "fire") else 2  # more than half of the camera rays collide, or more than a third
-    np.testing.assert_allclose(left.sum(axis=1), light.sum(axis=1) / k, rtol=1e-5)
+    # All rays count alike. More than half of the camera rays collide, or more than a third.
+    share = scaled / dL.max()
+    k = 1 if name in ("rgb", "fire") else 2
+    assert set(np.round(share[light > 0], 5)) == ({0.5, 1.0} if name == "glass" else {1 / k})
+    np.testing.assert_allclose(left.sum(axis=1), (share * light).sum(axis=1), rtol=1e-5)
 
 
 @pytest.mark.parametrize("depth", [3, 6])
@@ -200,13 +203,39 @@ def test_branches_of_a_stem_differ(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(derivatives._Branching, "of", lambda *args: made.append(real(*args)) or made[0])
     monkeypatch.setattr(derivatives, "BALANCE", 1e3)
     gradient_of_mean_image(smoky(), KEYS["density"], 64, fresh(3))
-    (stem, branches), share = made[0].gather(dr.arange(mi.UInt32, dr.width(made[0].collided))), made[0].share
+    number = dr.arange(mi.UInt32, dr.width(made[0].collided))
+    (stem, branches), share = made[0].gather(number), made[0].share_of(number)
     on = np.array(branches.active)
     stem, sampler = np.array(stem)[on], branches.sampler
     numbers = np.array([sampler.state, sampler.bits])[:, on]
     assert share[0] == 0.5
     assert np.array_equal(np.unique(stem, return_counts=True)[1], np.full(len(stem) // 2, 2))
     assert np.unique(numbers, axis=1).shape[1] == numbers.shape[1]
+
+
+def test_stems_branch_in_media_with_derivatives(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A collision in a medium without derivatives has one branch beside others with three; each stem sums its own branches."""
+    made = []
+    real = derivatives._Branching.of
+    monkeypatch.setattr(derivatives._Branching, "of", lambda *args: made.append((real(*args), args[0].media)) or made[0][0])
+    monkeypatch.setattr(derivatives, "BALANCE", 1e3)
+    fog = box_of(medium("mivol_medium", 2.0, 0.8), centred(np.eye(3), (0.3, -1.6, 0.4)))
+    gradient_of_mean_image(smoky(fog=fog), KEYS["density"], 64, fresh(3))
+    ((found, media),) = made
+    n = dr.width(found.collided)
+    number = dr.arange(mi.UInt32, n)
+    stem, branches = found.gather(number)
+    on, body = np.array(branches.active), np.array(branches.flight.body)
+    stems, counts = np.unique(np.array(stem)[on], return_counts=True)
+    of = dict(zip(np.array(stem)[on].tolist(), body[on].tolist(), strict=True))
+    in_smoke = np.array([media.bodies[of[k]].box.edge > 1.5 for k in stems.tolist()])
+    assert len(in_smoke) > np.count_nonzero(in_smoke) > 100
+    assert np.array_equal(counts, np.where(in_smoke, 3, 1))
+    assert np.array_equal(np.flatnonzero(np.array(found.start.active)), stems)
+    light, share = np.random.default_rng(0).random(n).astype(np.float32), np.array(found.share_of(number))
+    expected = np.bincount(np.array(stem)[on], (share * light)[on], n)
+    summed = found.add_light(dr.zeros(mi.Spectrum, n), mi.Spectrum(mi.Float(light)))
+    np.testing.assert_allclose(np.array(summed)[0], expected, rtol=1e-6)
 
 
 def test_branches_walk_side_by_side_by_their_length() -> None:
@@ -220,17 +249,20 @@ def test_branches_walk_side_by_side_by_their_length() -> None:
 
 
 @pytest.mark.parametrize(
-    ("collided", "noise", "near", "count"),
-    [(1000, 0.5, 0, 1), (400, 0.5, 0, 2), (400, 0.03, 0, 1), (200, 0.03, 0, 2), (1, 0.5, 0, 3), (0, 0.5, 0, 3),
-     (100, 0.05, 1, 2), (250, None, 0, 3), (100, None, 1, 3), (300, None, 1, 2)],
+    ("collided", "noise", "near", "single", "count"),
+    [(1000, 0.5, 0, 0, 1), (400, 0.5, 0, 0, 2), (400, 0.03, 0, 0, 1), (200, 0.03, 0, 0, 2), (1, 0.5, 0, 0, 3),
+     (0, 0.5, 0, 0, 3), (100, 0.05, 1, 0, 2), (250, None, 0, 0, 3), (100, None, 1, 0, 3), (300, None, 1, 0, 2),
+     (250, None, 0, 300, 2), (250, None, 0, 600, 1), (0, 0.5, 0, 1000, 1)],
 )  # fmt: skip
-def test_fewer_collisions_and_more_noise_need_more_branches(collided: int, noise: float | None, near: int, count: int) -> None:
+def test_fewer_collisions_and_more_noise_need_more_branches(
+    collided: int, noise: float | None, near: int, single: int, count: int
+) -> None:
     """sqrt(26 noise / share), or sqrt(5 noise / share) beside near light on segments, rounded, at most 3; a noise of 0.15
-    without a baseline; never more branches than stems."""
+    without a baseline; never more branches than stems, of which some have one branch."""
     baseline = None if noise is None else SimpleNamespace(noise=mi.Float(noise))
     estimators = SimpleNamespace(segment=SimpleNamespace(baseline=baseline), near=near or None)
-    assert int(count_branches(estimators, 1000, mi.UInt32(collided))[0]) == count
-    assert count * collided <= 1000
+    assert int(count_branches(estimators, 1000, mi.UInt32(collided), mi.UInt32(single))[0]) == count
+    assert count * collided + single <= 1000
 
 
 def test_without_collisions_probes_give_the_derivative(replays: list) -> None:

@@ -131,6 +131,12 @@ class Body:
         return any(self.follows) or is_followed(self.view.microflakes)
 
     @property
+    def is_followed(self) -> bool:
+        """Whether the extinction, the albedo or the phase function is differentiated."""
+        with dr.resume_grad():
+            return self.follows_extinction or self.follows_albedo or dr.grad_enabled(self.phase)
+
+    @property
     def has_tangents(self) -> bool:
         """Whether some part, or the microflakes, have a tangent in a forward pass."""
         return any(self.has_tangent) or self.microflakes_tangent is not None

@@ -23,6 +23,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import or_
 
 import drjit as dr
 import mitsuba as mi
@@ -91,19 +93,21 @@ BASELINE_SEED = 0x1E7E1
 # -- Branching paths -----------------------------------------------------------------------------------------------------
 
 
-def count_branches(estimators: Estimators, stems: int, collided: mi.UInt32) -> mi.UInt32:
+def count_branches(estimators: Estimators, stems: int, collided: mi.UInt32, single: mi.UInt32) -> mi.UInt32:
     """Number of branches of a path (an array of one number).
 
     Args:
         estimators: estimators of the render.
-        stems, collided: number of stems, and of stems with a collision.
+        stems, collided: number of stems, and of stems with a collision that may have several branches.
+        single: number of stems with one branch.
     """
     baseline = estimators.segment.baseline
     noise = USUAL_NOISE if baseline is None else baseline.noise
     balance = BALANCE if estimators.near is None else BALANCE_OF_SEGMENTS
-    share = mi.Float(dr.maximum(collided, 1)) / dr.opaque(mi.Float, stems)
-    # A lane for each stem holds at most 1 / share branches.
-    return mi.UInt32(dr.clip(dr.round(dr.sqrt(balance * noise / share)), 1, dr.minimum(MAX_BRANCHES, 1 / share)))
+    several, lanes = mi.Float(dr.maximum(collided, 1)), dr.opaque(mi.Float, stems)
+    # There is a lane for each stem.
+    most = dr.clip((lanes - mi.Float(single)) / several, 1, MAX_BRANCHES)
+    return mi.UInt32(dr.clip(dr.round(dr.sqrt(balance * noise * lanes / several)), 1, most))
 
 
 def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -> None:
@@ -138,7 +142,7 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
     # -- Their replays ---------------------------------------------------------------------------------------------------
     order = lengths.sort()
     stem, branches = branching.gather(order)
-    branch_score = Replay(dr.gather(mi.Spectrum, L, order), dr.gather(mi.Spectrum, dL, stem) * branching.share)
+    branch_score = Replay(dr.gather(mi.Spectrum, L, order), dr.gather(mi.Spectrum, dL, stem) * branching.share_of(order))
     stem_score = Replay(branching.add_light(stem_light, L), dL)
     listed = None
     if n >= MIN_LISTED and any(body.needs_probes for body in estimators.media.bodies):
@@ -228,21 +232,26 @@ def replay_in_one_kernel(width: int, walk: Callable[[mi.Bool], object]) -> None:
 
 @dataclass
 class _Branching:
-    """The collisions at the ends of stems, each with as many branches.
+    """The collisions at the ends of stems, each with as many branches; one, in a medium without derivatives beside others with.
 
     Attributes:
         start: starts of branches, without their random numbers: at the collisions, with the random numbers of the stems.
-        collided: the stems with a collision; the other numbers are left over.
+        collided: the stems with several branches in front, the stems with one at the back, in reverse order; the other numbers
+            are left over.
+        has_several: stems with several branches.
         place: place of each stem with a collision in ``collided``.
-        count: number of these stems (an array of one number).
-        each: branches of a stem (an array of one number).
+        count: number of the stems with several branches (an array of one number).
+        single: number of the stems with one (an array of one number).
+        each: branches of a stem with several (an array of one number).
         stem_rooms, rooms: segments of a stem and of a branch in memory: branches behind stems. 0 without memory.
     """
 
     start: PathStart
     collided: mi.UInt32
+    has_several: mi.Bool
     place: mi.UInt32
     count: mi.UInt32
+    single: mi.UInt32
     each: mi.UInt32
     stem_rooms: int = 0
     rooms: int = 0
@@ -257,40 +266,51 @@ class _Branching:
             sampler: random numbers of the stems from the camera on.
         """
         start = PathStart.at_stop(stems, sampler)
-        n = dr.width(start.active)
-        count, collided = dr.opaque(mi.UInt32, 0), dr.empty(mi.UInt32, n)
-        place = dr.scatter_inc(count, mi.UInt32(0), start.active)
+        n, several = dr.width(start.active), mi.Bool(start.active)
+        followed = [body.is_followed for body in estimators.media.bodies]
+        if any(followed) and not all(followed):
+            # The light behind a collision counts in full at the collision itself, and only if the medium has derivatives.
+            several &= reduce(or_, (start.flight.body == k for k, on in enumerate(followed) if on))
+        count, single, collided = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 0), dr.empty(mi.UInt32, n)
+        place = dr.scatter_inc(count, mi.UInt32(0), several)
+        if not all(followed):
+            place = dr.select(several, place, n - 1 - dr.scatter_inc(single, mi.UInt32(0), start.active & ~several))
         dr.scatter(collided, dr.arange(mi.UInt32, n), place, start.active)
-        dr.eval(start, collided, place, count)
-        return cls(start, collided, place, count, count_branches(estimators, n, count))
+        dr.eval(start, collided, several, place, count, single)
+        return cls(start, collided, several, place, count, single, count_branches(estimators, n, count, single))
 
-    @property
-    def share(self) -> mi.Float:
-        """Share of each branch in the light of its stem [1]."""
-        return dr.rcp(mi.Float(self.each))
+    def share_of(self, number: mi.UInt32) -> mi.Float:
+        """Share of the branches with these numbers in the light of their stems [1]."""
+        return dr.select(number < self.count * self.each, dr.rcp(mi.Float(self.each)), 1)
 
     def gather(self, number: mi.UInt32) -> tuple[mi.UInt32, PathStart]:
         """The stems and the starts of the branches with these numbers: the branches of a stem have consecutive numbers.
 
         There is a lane for each stem, since a recording cannot depend on the number of branches; the last lanes are off.
         """
-        on = number < self.count * self.each
-        stem = dr.gather(mi.UInt32, self.collided, number // self.each, on)
+        n, ahead = dr.width(number), self.count * self.each
+        is_one_of_several, beyond = number < ahead, number - ahead
+        on = is_one_of_several | (beyond < self.single)
+        stem = dr.gather(mi.UInt32, self.collided, dr.select(is_one_of_several, number // self.each, n - 1 - beyond), on)
         start = self.start.gather(stem, on)
-        start.sampler = start.sampler.branch(number % self.each, self.each)
+        branch, of = dr.select(is_one_of_several, number % self.each, 0), dr.select(is_one_of_several, self.each, 1)
+        start.sampler = start.sampler.branch(branch, of)
         if self.rooms:
-            n = dr.width(number)
             start.number = SegmentNumber(number + self.stem_rooms * n, dr.full(mi.UInt32, self.rooms, n))
         return stem, start
 
     def add_light(self, stems: mi.Spectrum, branches: mi.Spectrum) -> mi.Spectrum:
         """The radiance of each stem, with its share of the radiance of its branches."""
+        each = dr.select(self.has_several, self.each, 1)
+        last = dr.width(self.collided) - 1
+        first = dr.select(self.has_several, self.place * each, self.count * self.each + last - self.place)
+        share = dr.rcp(mi.Float(each))
 
         def add(number: mi.UInt32, L: mi.Spectrum) -> tuple[mi.UInt32, mi.Spectrum]:
-            return number + 1, L + dr.gather(mi.Spectrum, branches, self.place * self.each + number) * self.share
+            return number + 1, L + dr.gather(mi.Spectrum, branches, first + number) * share
 
         begun = dr.zeros(mi.UInt32, dr.width(stems)), mi.Spectrum(stems)
-        return dr.while_loop(begun, lambda number, L: self.start.active & (number < self.each), add, label="branches")[1]
+        return dr.while_loop(begun, lambda number, L: self.start.active & (number < each), add, label="branches")[1]
 
 
 @dataclass
