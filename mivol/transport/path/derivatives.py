@@ -9,12 +9,16 @@ only; the few branches cause most of the noise of a gradient. Branches lie side 
 is known, so few lanes wait for their neighbours.
 
 Let A be the variance of stems and B of a branch, at the costs a and b. The variance A + B / k at the cost a + b k is best at
-k = sqrt(B a / (A b)), and b is proportional to the share of stems with a collision.
+k = sqrt(B a / (A b)), and b is proportional to the share of stems with a collision. The light behind a collision multiplies the
+derivative of the collision itself. Beside media with derivatives, a stem that collides in a medium without has one branch.
+
+A replay reads from memory what the first walk has found (:mod:`.kept_segments`).
 
 Only the device knows the number of branches, so that derivatives can be recorded and replayed. Branches have as many lanes as
 stems, of which the last are off.
 
-Bias: none. Memory: about 80 numbers a stem, 120 with probes (160 with surfaces).
+Bias: none. Memory: about 80 numbers a stem, 120 with probes (160 with surfaces); up to 40 numbers more for segments in passes
+of many rays (100 beside near light).
 
 References: Arvo & Kirk 1990 (splitting); Vicini et al. 2021 (path replay).
 """
