@@ -7,6 +7,7 @@ from typing import Any
 import mitsuba as mi
 
 from mivol.errors import MivolError
+from mivol.scene.kept_sessions import take_session
 from mivol.scene.session import Session
 from mivol.transport.path.estimators import Settings
 
@@ -62,17 +63,17 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
         develop: bool = True,
         evaluate: bool = True,
     ) -> mi.TensorXf:
-        return self.session.render(scene, sensor, seed, spp, develop, evaluate)
+        return self._session_for(scene).render(scene, sensor, seed, spp, develop, evaluate)
 
     def render_forward(
         self, scene: mi.Scene, params: Any, sensor: int | mi.Sensor = 0, seed: int = 0, spp: int = 0
     ) -> mi.TensorXf:
-        return self.session.render_forward(scene, sensor, seed, spp)
+        return self._session_for(scene).render_forward(scene, sensor, seed, spp)
 
     def render_backward(
         self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf, sensor: int | mi.Sensor = 0, seed: int = 0, spp: int = 0
     ) -> None:
-        self.session.render_backward(scene, grad_in, sensor, seed, spp)
+        self._session_for(scene).render_backward(scene, grad_in, sensor, seed, spp)
 
     def sample(
         self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, medium: mi.Medium = None, active: mi.Bool = True, **_: Any
@@ -80,6 +81,11 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
         # Integrators that nest this one call it as they call every ADIntegrator: by keywords, among them ``mode`` and
         # ``state_in``, and without the sensor's medium; they expect a state for a second pass, which mivol does not need.
         return *self.session.sample(scene, sampler, ray, active), None
+
+    def _session_for(self, scene: mi.Scene) -> Session:
+        """The session by which this integrator renders a scene."""
+        self.session = take_session(self, self.session, scene)
+        return self.session
 
     def to_string(self) -> str:
         return repr(self.session)

@@ -143,6 +143,16 @@ class Session:
         s = self.settings
         return f"mivol[max_depth={s.max_depth}, rr_depth={s.rr_depth}, aovs={','.join(self.aovs)}]"
 
+    @property
+    def is_new(self) -> bool:
+        """Whether the session has rendered nothing."""
+        return not self._scenes
+
+    def is_like(self, other: Session) -> bool:
+        """Whether both sessions have the same settings."""
+        settings, others = ((one.settings, one.aovs, one.is_depth_given) for one in (self, other))
+        return settings == others
+
     def render(
         self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int, develop: bool = True, evaluate: bool = True
     ) -> mi.TensorXf:
