@@ -32,7 +32,15 @@ from mivol.transport.media.extinction import to_components
 from mivol.transport.media.phases import Phase, read_phase
 from mivol.transport.path.derivatives import carry_tangents, prepare_derivatives, replay_branches
 from mivol.transport.path.estimators import Estimators, Settings
-from mivol.transport.path.film import CameraRays, LightOfOwnRays, RenderSamples, adjoint_rays, count_passes, render_on_film
+from mivol.transport.path.film import (
+    CameraRays,
+    LightOfOwnRays,
+    RenderSamples,
+    adjoint_rays,
+    count_passes,
+    render_on_film,
+    sample_rays,
+)
 from mivol.transport.path.successive import paths_per_lane, walk_branching, walk_successively
 from mivol.transport.path.walk import (
     has_one_segment,
@@ -60,6 +68,8 @@ class PreparedArrays:
             records.
         bright: table for samples of the environment map, in images (:class:`BrightMap`).
         phases: the phase function of each medium, whose arrays Mitsuba hides from Dr.Jit.
+        rays: the rays and weights of a sensor whose arrays Mitsuba hides (:func:`mivol.transport.path.film.sample_rays`); None
+            to sample the sensor in the render.
     """
 
     readings: Readings
@@ -70,6 +80,7 @@ class PreparedArrays:
     balls: mi.Float | None
     bright: BrightMap | None
     phases: list[Phase] = field(default_factory=list)
+    rays: list[tuple[mi.Ray3f, mi.Spectrum]] | None = None
 
 
 @dataclass
@@ -218,7 +229,17 @@ class RenderTask(RecordedTask):
 
     def samples(self, sensor: mi.Sensor, arrays: PreparedArrays, seed: mi.UInt32) -> RenderSamples:
         """The samples of the render."""
-        return RenderSamples(sensor, seed, self.spp, self.plan.pass_rays, arrays.views)
+        given = None if arrays.rays is None else iter(arrays.rays)
+        return RenderSamples(sensor, seed, self.spp, self.plan.pass_rays, arrays.views, given)
+
+    def with_rays(self, sensor: mi.Sensor, arrays: PreparedArrays, seed: mi.UInt32) -> PreparedArrays:
+        """The arrays with the rays of the sensor."""
+        own = [count for count, _ in self.list_own_rays(sensor)]
+        return replace(arrays, rays=sample_rays(self.samples(sensor, arrays, seed), own))
+
+    def list_own_rays(self, sensor: mi.Sensor) -> list[tuple[int, str]]:
+        """Rays of a pixel for light with rays of its own, and the names of their estimators: only images have them."""
+        return []
 
 
 class JoiningTask(RecordedTask):
@@ -236,13 +257,18 @@ class ImageTask(RenderTask):
 
     def __call__(self, scene: mi.Scene, sensor: mi.Sensor, arrays: PreparedArrays, seed: mi.UInt32) -> mi.TensorXf:
         samples, plan, estimators = self.samples(sensor, arrays, seed), self.plan, self.build_estimators(scene, arrays)
-        spp = self.spp or sensor.sampler().sample_count()
-        own = [(spp * plan.lamp_rays, estimators.of_lamps)] if plan.lamp_rays else []
-        own += [(plan.emission_rays, estimators.of_camera_emission)] if plan.emission_rays else []
-        own += [(plan.mirror_rays, estimators.of_mirrors)] if plan.mirror_rays else []
-        lights = [LightOfOwnRays(count, partial(_find_radiance, find())) for count, find in own]
+        lights = [
+            LightOfOwnRays(count, partial(_find_radiance, getattr(estimators, name)()))
+            for count, name in self.list_own_rays(sensor)
+        ]
         estimators = plan.light_of_paths(estimators)
         return render_on_film(samples, self.aovs, lambda rays: _render_primal(estimators, rays, plan, self.aovs), lights)
+
+    def list_own_rays(self, sensor: mi.Sensor) -> list[tuple[int, str]]:
+        plan, spp = self.plan, self.spp or sensor.sampler().sample_count()
+        counts = spp * plan.lamp_rays, plan.emission_rays, plan.mirror_rays
+        names = "of_lamps", "of_camera_emission", "of_mirrors"
+        return [(count, name) for count, name in zip(counts, names, strict=True) if count]
 
 
 class GradientTask(RenderTask):

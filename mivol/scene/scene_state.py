@@ -16,11 +16,10 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.scene.foreign_plugins import UnfollowedStateError, describe_foreign, is_foreign
-from mivol.scene.stand_in import ARRAYS, FOUND_SENSOR, RECORDED_FILM, describe_kind
-from mivol.scene_graph import find_children, list_values, read_value, traverse
+from mivol.scene.stand_in import RECORDED_FILM, describe_kind, is_found
+from mivol.scene_graph import list_values, read_value, traverse
 from mivol.transport.media.medium_view import STOCK
 from mivol.transport.media.phases import find_plugins
-from mivol.transport.path.film import find_batch_views
 
 FOLLOWED = ("data", "value")
 """Names of the parameters of volumes and textures whose values a recording follows."""
@@ -171,11 +170,9 @@ def find_hidden_arrays(scene: mi.Scene, sensor: mi.Sensor) -> str | None:
         return f"recordings have not been tried with {mi.variant()}"
     if sensor.film().class_name() != RECORDED_FILM:
         return f"the film is a {sensor.film().class_name()}"
-    views = [sensor] if find_batch_views(sensor) is None else find_children(sensor).values()
-    strange = sorted({v.class_name() for v in views if isinstance(v, mi.Sensor)} - {FOUND_SENSOR})
-    if strange and describe_kind(sensor) is None:
-        what = f" with a sampler of the kind {sensor.sampler().class_name()}" if strange[0] in ARRAYS else ""
-        return f"the sensor is a {strange[0]}{what}"
+    if not is_found(sensor) and describe_kind(sensor) is None:
+        with_sampler = f"with a sampler of the kind {sensor.sampler().class_name()}"
+        return f"the sensor is a {sensor.class_name()} {with_sampler if sensor.get_medium() is None else 'in a medium'}"
     params = traverse(scene)
     try:
         for node in filter(is_foreign, params.hierarchy):
@@ -228,7 +225,7 @@ def _is_followed(params: mi.SceneParameters, key: str) -> bool:
         return True
     if isinstance(owner, mi.Shape):
         return is_painted(name) or (name in SHAPE_PLACES and (owner.is_mesh() or owner.class_name() in PLACED_SHAPES))
-    return isinstance(owner, mi.Sensor) and owner.class_name() in ARRAYS
+    return isinstance(owner, mi.Sensor)
 
 
 def is_painted(name: str) -> bool:

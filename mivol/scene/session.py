@@ -237,7 +237,8 @@ class Session:
         if stand_in is not None:
             stand_in.meet(sensor, scene.sensors(), self.aovs)
             stand_in.show(sensor, opened.state.of_sensor)
-            given = (scene, stand_in.camera, *given[2:])
+            arrays = make().with_rays(sensor, given[2], inputs[0]) if stand_in.takes_rays else given[2]
+            given = (scene, stand_in.camera, arrays, *inputs)
         self._reset(given[1])
         gradients = [(value, dr.grad(value)) for value in attached]
         try:
@@ -250,7 +251,7 @@ class Session:
             for value, gradient in gradients:
                 dr.set_grad(value, gradient)
         try:
-            return make()(scene, sensor, *given[2:])
+            return make()(scene, sensor, opened.read_arrays(), *inputs)
         except RuntimeError as error:
             if OUT_OF_MEMORY not in f"{error} {error.__cause__}":
                 raise

@@ -2,7 +2,8 @@
 
 Dr.Jit 1.5 finds the arrays of every plugin in memory, and records anew if other plugins share arrays with the inputs. A render
 through another camera of the scene changes the shared arrays. The stand-in is a separate camera with the numbers of the
-camera to render.
+camera to render. Other sensors (``radiancemeter``, ``irradiancemeter``, ``distant``, a ``batch`` of several kinds) are sampled
+before the render, and their stand-in is a film and a sampler alone.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from weakref import WeakValueDictionary
 import drjit as dr
 import mitsuba as mi
 
-from mivol.scene_graph import traverse
+from mivol.scene_graph import find_children, traverse
 
 RECORDED_FILM = "HDRFilm"
 """The film that can be recorded."""
@@ -31,7 +32,7 @@ ARRAYS = {
     "OrthographicCamera": (),
     "ThinLensCamera": ("x_fov", "aperture_radius", "focus_distance"),
 }
-"""Classes of cameras that may have a stand-in, with the names of their parameters that are arrays, besides ``to_world``."""
+"""Classes of cameras whose stand-in samples rays, with the names of their parameters that are arrays, besides ``to_world``."""
 
 FORMATS = {
     "y": "luminance",
@@ -47,14 +48,21 @@ NUMBERS = ("near_clip", "far_clip", "shutter_open", "shutter_open_time")
 
 
 def describe_kind(sensor: mi.Sensor) -> str | None:
-    """The common properties of cameras with the same stand-in; None if a camera has no stand-in."""
+    """The common properties of sensors with the same stand-in; None if a sensor has no stand-in."""
     film, sampler, name = sensor.film(), sensor.sampler(), sensor.class_name()
-    is_plain = name in ARRAYS and film.class_name() == RECORDED_FILM
-    if not is_plain or sampler.class_name() != "IndependentSampler" or sensor.get_medium() is not None:
+    is_plain = film.class_name() == RECORDED_FILM and sampler.class_name() == "IndependentSampler"
+    if not is_plain or sensor.get_medium() is not None or (is_found(sensor) and name != FOUND_SENSOR):
         return None
     # Constants of a camera in Python; parameters of a perspective camera.
-    times = "" if name == FOUND_SENSOR else f"{sensor.shutter_open()} {sensor.shutter_open_time()}"
+    times = f"{sensor.shutter_open()} {sensor.shutter_open_time()} {sensor.needs_aperture_sample()}"
+    times = "" if name == FOUND_SENSOR else times
     return f"{name}{times}{film}{sampler.sample_count()}" if _pixel_format(film) in FORMATS else None
+
+
+def is_found(sensor: mi.Sensor) -> bool:
+    """Whether Dr.Jit finds all arrays of a sensor: of a perspective camera, and of a ``batch`` of perspective cameras."""
+    views = [sensor] if sensor.class_name() != "BatchSensor" else find_children(sensor).values()
+    return {view.class_name() for view in views if isinstance(view, mi.Sensor)} == {FOUND_SENSOR}
 
 
 def _pixel_format(film: mi.Film) -> str:
@@ -134,6 +142,7 @@ class StandIn:
 
     Attributes:
         camera: the camera to render.
+        takes_rays: whether the camera gives a film and a sampler alone, and the rays are sampled before the render.
     """
 
     _known: ClassVar[WeakValueDictionary[tuple[str, str], StandIn]] = WeakValueDictionary()
@@ -163,6 +172,7 @@ class StandIn:
         sampler = {"type": "independent", "sample_count": sensor.sampler().sample_count()}
         parts = {"film": {"type": "hdrfilm", **own}, "sampler": sampler}
         self._is_found = sensor.class_name() == FOUND_SENSOR
+        self.takes_rays = sensor.class_name() not in ARRAYS
         if self._is_found:
             self.camera = mi.load_dict({"type": "perspective", **parts}, parallel=False)
             self._params = traverse(self.camera)
@@ -170,6 +180,10 @@ class StandIn:
             opened, closed = sensor.shutter_open(), sensor.shutter_open() + sensor.shutter_open_time()
             parts |= {"shutter_open": opened, "shutter_close": closed, "on_lens": sensor.needs_aperture_sample()}
             self.camera = mi.load_dict({"type": "mivol_copied_camera", **parts}, parallel=False)
+            if self.takes_rays:
+                # A batch calls all sensors of the process in one function.
+                self.camera.to_world = mi.Matrix4f(1)
+                self.camera.take_lens(dr.opaque(mi.Float, 1), dr.opaque(mi.Float, 2))
         self._shown: tuple | None = None
         self._seen: tuple[int, list] | None = None
         self._lens: list[float] | None = None
@@ -178,7 +192,7 @@ class StandIn:
 
     def show(self, sensor: mi.Sensor, state: list) -> None:
         """Take the numbers of a camera of the kind, unless it was shown last in the same state of its parameters."""
-        if self._seen != (sensor.ptr, state):
+        if not self.takes_rays and self._seen != (sensor.ptr, state):
             self._take_numbers(sensor)
             self._seen = sensor.ptr, state
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import weakref
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -170,6 +171,22 @@ def test_neither_passes_nor_a_crop_change_the_points_of_a_pixel():
         assert all(np.array_equal(found[pixel], whole[pixel]) for pixel in inside)
     other = points(sensor_of(rfilter="gaussian"), 12, 1 << 20, seed=6)
     assert not any((other[pixel] == whole[pixel]).any() for pixel in whole)
+
+
+def test_an_image_of_given_rays_is_that_of_the_sensor():
+    """Each ray where the sensor sends it: of passes of 2 samples a pixel, and of light with 2 and 3 rays a pixel of its own."""
+
+    def colour(rays: film.CameraRays) -> mi.Spectrum:
+        return mi.Spectrum(*(2 + rays.ray.d))
+
+    lights = [film.LightOfOwnRays(count, colour) for count in (2, 3)]
+    samples = film.RenderSamples(mi.load_dict(sensor_of("thinlens", "gaussian")), mi.UInt32(5), 4, 2 * 144)
+    given = replace(samples, given=iter(film.sample_rays(samples, [2, 3])))
+    found, truth = (
+        np.array(film.render_on_film(one, [], lambda rays: (colour(rays), mi.Float(1), []), lights)) for one in (given, samples)
+    )
+    np.testing.assert_array_equal(found, truth)
+    assert next(given.given, None) is None and truth.std() > 0
 
 
 def test_the_samples_of_a_pixel_are_a_net():

@@ -948,6 +948,58 @@ def test_a_stand_in_has_the_rays_of_the_given_camera(kind: str) -> None:
         np.testing.assert_array_equal(np.array(weight), np.array(its_weight))
 
 
+def screen_with_meter() -> dict:
+    """A square that faces the smoke and measures the light on it, under a lamp with a size: lamps have rays of their own."""
+    place = mi.ScalarTransform4f().translate([0, -1.5, 0]).rotate([1, 0, 0], -90)
+    film = {"type": "hdrfilm", "width": 2, "height": 1, "rfilter": {"type": "box"}}
+    lamp = {"type": "sphere", "center": [0.3, 1.2, 1.0], "radius": 0.3, "emitter": {"type": "area", "radiance": 3.0}}
+    meter = {"type": "irradiancemeter", "film": film}
+    return {"screen": {"type": "rectangle", "to_world": place, "meter": meter}, "lamp": lamp}
+
+
+def single_pixel(kind: str, **more: object) -> dict:
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    return {"meter": {"type": kind, "film": film, **more}}
+
+
+def views_of_two_kinds() -> dict:
+    place = mi.ScalarTransform4f().look_at([1, -3, 1], [0, 0, 0], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 4, "height": 4}
+    view = {"to_world": place, "film": film}
+    first, second = {"type": "perspective", **view}, {"type": "orthographic", **view}
+    return {"type": "batch", "first": first, "second": second, "film": film | {"width": 8}}
+
+
+METERS: dict[str, Callable[[], dict]] = {
+    "radiance meter": lambda: single_pixel("radiancemeter", origin=[0, -3, 0], direction=[0.1, 1, 0.1]),
+    "distant": lambda: single_pixel("distant", direction=[0.1, 1, 0.1]),
+    "irradiance meter": screen_with_meter,
+    "batch": lambda: {"meter": views_of_two_kinds()},
+}
+"""Sensors whose arrays Mitsuba hides."""
+
+
+@pytest.mark.parametrize("name", cases(METERS, slow=("distant",)))
+def test_a_sensor_whose_arrays_are_hidden_is_recorded(name: str) -> None:
+    """Its rays are an input: images to the last bit, gradients but for the rounding of their sums."""
+    pair, counts = Pair(smoke_under(sky=sky(0.7), **METERS[name]()), 3), []
+    sensor = next(one for one in pair.scene.sensors() if one.class_name() != "PerspectiveCamera")
+    show = partial(mi.render, pair.scene, pair.params, sensor=sensor, spp=6)
+    for call in range(6):
+        pair.scale(INSIDE + "sigma_t.data", 0.9)
+        pair.scale("sky.radiance.value", 1.1)
+        found, truth = (np.array(show(integrator=one, seed=call)) for one in (pair.recorded, pair.traced))
+        assert np.array_equal(found, truth) and truth.max() > 0
+        gradients = []
+        for integrator in (pair.recorded, pair.traced):
+            with pair.differentiated(INSIDE + "sigma_t.data") as value:
+                dr.backward(dr.mean(show(integrator=integrator, seed=call), axis=None))
+                gradients.append(np.array(dr.ravel(dr.grad(value))))
+        assert np.abs(gradients[0] - gradients[1]).max() <= 400 * 2**-24 * np.abs(gradients[1]).max() > 0
+        counts.append(pair.recordings.count)
+    assert counts[2] == counts[5] > 0 and not any(pair.recordings.failures.values())
+
+
 def test_a_turn_to_another_camera_launches_nothing_more() -> None:
     """An update of Mitsuba's camera makes 115 launches, and waits for each of 79 numbers."""
     angles = (0.0, 1.0, 2.0)
@@ -964,8 +1016,11 @@ def test_a_turn_to_another_camera_launches_nothing_more() -> None:
 
 @pytest.mark.parametrize("pixel_format", FORMATS.values())
 def test_a_stand_in_has_a_film_like_the_given_one(pixel_format: str) -> None:
-    """A camera without a picture has no stand-in."""
-    assert describe_kind(mi.load_dict({"type": "radiancemeter", "film": {"type": "hdrfilm", "width": 1, "height": 1}})) is None
+    film = {"type": "hdrfilm", "width": 1, "height": 1}
+    views = {f"view{k}": {"type": kind, "film": film} for k, kind in enumerate(("perspective", "orthographic"))}
+    assert describe_kind(mi.load_dict({"type": "batch", **views, "film": film | {"width": 2}})) is not None
+    # Dr.Jit finds all arrays of this batch.
+    assert describe_kind(mi.load_dict({"type": "batch", "view": views["view0"], "film": film})) is None
     size = {"width": 8, "height": 6, "crop_width": 4, "crop_height": 3, "crop_offset_x": 1, "crop_offset_y": 2}
     film = {"type": "hdrfilm", "rfilter": {"type": "mitchell"}, "sample_border": True, "pixel_format": pixel_format, **size}
     sensor = mi.load_dict({"type": "perspective", "film": film, "sampler": {"type": "independent", "sample_count": 3}})
@@ -1013,8 +1068,10 @@ def test_what_cannot_be_recorded_is_named() -> None:
     spread = mi.load_dict({**lens, "sampler": {"type": "multijitter"}})
     sentence = "the sensor is a ThinLensCamera with a sampler of the kind MultijitterSampler"
     assert find_hidden_arrays(scene, spread) == sentence
-    pencils = mi.load_dict(batch_of(pencil((0, -4, 0), (0, 1, 0))))
-    assert find_hidden_arrays(scene, pencils) == "the sensor is a RadianceMeter"
+    beam = pencil((0, -4, 0), (0, 1, 0))
+    assert find_hidden_arrays(scene, mi.load_dict(batch_of(beam))) is None
+    inside = mi.load_dict(beam | {"medium": {"type": "homogeneous"}})
+    assert find_hidden_arrays(scene, inside) == "the sensor is a RadianceMeter in a medium"
     for phase in (blend_of_blends(), microflakes()):
         known = smoke_under(phase=phase, other=box_of(medium("homogeneous", 1.0, 0.5, phase={"type": "rayleigh"}), PLACE))
         assert find_hidden_arrays(known, known.sensors()[0]) is None

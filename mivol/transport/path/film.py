@@ -24,7 +24,7 @@ from mivol.scene_graph import find_children
 from mivol.transport.traversal.random_numbers import SpreadSampler
 from mivol.transport.traversal.rays import give_each_lane_a_ray
 
-__all__ = ["CameraRays", "LightOfOwnRays", "RenderSamples", "adjoint_rays", "film_passes", "render_on_film"]
+__all__ = ["CameraRays", "LightOfOwnRays", "RenderSamples", "adjoint_rays", "film_passes", "render_on_film", "sample_rays"]
 
 
 @dataclass
@@ -37,6 +37,7 @@ class RenderSamples:
         spp: samples per pixel; 0 for the sample count of the sensor's sampler.
         pass_rays: largest number of rays in a pass.
         views: sensors of a ``batch`` (:func:`find_batch_views`); None for another sensor.
+        given: the rays and weights of the passes in their order (:func:`sample_rays`); None to sample the sensor.
     """
 
     sensor: mi.Sensor
@@ -44,6 +45,11 @@ class RenderSamples:
     spp: int
     pass_rays: int
     views: mi.SensorPtr | None = None
+    given: Iterator[tuple[mi.Ray3f, mi.Spectrum]] | None = None
+
+    def of_own_rays(self, number: int, per_pixel: int) -> RenderSamples:
+        """The samples of light with rays of its own, by its number."""
+        return replace(self, spp=per_pixel, seed=self.seed ^ (OWN_SEED + number))
 
 
 @dataclass
@@ -95,6 +101,19 @@ def film_passes(samples: RenderSamples) -> Iterator[CameraRays]:
     base.set_samples_per_wavefront(per_pass)
     for index in range(base.sample_count() // per_pass):
         yield _camera_rays(samples, base, index, per_pass)
+
+
+def sample_rays(samples: RenderSamples, own: Sequence[int]) -> list[tuple[mi.Ray3f, mi.Spectrum]]:
+    """Sample the rays and weights of all passes before a render that a recording replays, in memory.
+
+    Args:
+        samples: samples of the render.
+        own: rays of a pixel for each light with rays of its own.
+    """
+    parts = [*(samples.of_own_rays(number, per_pixel) for number, per_pixel in enumerate(own)), samples]
+    found = [(mi.Ray3f(rays.ray), mi.Spectrum(rays.weight)) for part in parts for rays in film_passes(part)]
+    dr.make_opaque(found)
+    return found
 
 
 def count_passes(sensor: mi.Sensor, spp: int, pass_rays: int) -> int:
@@ -182,11 +201,14 @@ def find_batch_views(sensor: mi.Sensor) -> mi.SensorPtr | None:
 
 
 def _sample_rays(samples: RenderSamples, time: mi.Float, on_film: mi.Point2f, aperture: mi.Point2f) -> tuple:
-    """Mitsuba's rays of a sensor, and their weights.
+    """Mitsuba's rays of a sensor, and their weights; or those given.
 
     A ``batch`` keeps the index of the last view in an array that Dr.Jit does not find, and a later recording aborts the
     process. So the view of each ray is chosen here, as in Mitsuba.
     """
+    if samples.given is not None:
+        ray, weight = next(samples.given)
+        return mi.RayDifferential3f(ray), weight
     sensor, wavelength = samples.sensor, mi.Float(0)
     if samples.views is not None:
         count = dr.width(samples.views)
@@ -213,7 +235,8 @@ def render_on_film(
         Image (height, width, colours + AOVs).
     """
     film = samples.sensor.film()
-    light = sum((_average_light(samples, other, OWN_SEED + number) for number, other in enumerate(own)), mi.Float(0))
+    lights = (_average_light(samples.of_own_rays(number, other.per_pixel), other) for number, other in enumerate(own))
+    light = sum(lights, mi.Float(0))
     film.prepare(names)
     for rays in film_passes(samples):
         L, alpha, aovs = sample(rays)
@@ -227,11 +250,11 @@ def render_on_film(
     return film.develop()
 
 
-def _average_light(samples: RenderSamples, own: LightOfOwnRays, seed: int) -> mi.Float:
+def _average_light(samples: RenderSamples, own: LightOfOwnRays) -> mi.Float:
     """The light of rays of their own in each pixel of a block (3 channels): the mean over their filter weights."""
     film, total = samples.sensor.film(), None
     channels = film.prepare([])
-    for rays in film_passes(replace(samples, spp=own.per_pixel, seed=samples.seed ^ seed)):
+    for rays in film_passes(samples):
         block = _new_block(film, rays)
         light = own.sample(rays) * rays.weight
         _add_samples(block, film, rays, _FilmSample(light, mi.Float(1), mi.Float(1), []))
