@@ -23,6 +23,7 @@ import mitsuba as mi
 import pytest
 
 from mivol import machine
+from mivol.scene import kept_sessions
 from mivol.threads import set_thread_count
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -146,6 +147,18 @@ def each_variant(request: pytest.FixtureRequest) -> str:
     """Each JIT variant of the CPU for rgb and mono, one after the other; its name."""
     mi.set_variant(request.param)
     return request.param
+
+
+@pytest.fixture(autouse=True)
+def own_sessions(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An integrator takes over no recordings of an earlier integrator, which a test may have made with other code."""
+    if "shared_sessions" not in request.fixturenames:
+        monkeypatch.setattr(kept_sessions, "take_session", lambda integrator, session, scene: session)
+
+
+@pytest.fixture
+def shared_sessions() -> None:
+    """Integrators take over the sessions of earlier integrators, as those of users do."""
 
 
 @pytest.fixture

@@ -428,18 +428,18 @@ def build_estimators(
     for_images: bool,
     readings: Readings | None = None,
     tracer: mi.Scene | None = None,
-    balls: mi.Float | None = None,
+    emitters: mi.Float | None = None,
     bright: BrightMap | None = None,
 ) -> Estimators:
     """Build the planned estimators, for images or for derivatives; ``readings`` and ``tracer`` as for :func:`build_media`,
-    ``balls`` and ``bright``, in images, as for :class:`DirectLighting`.
+    ``emitters`` and ``bright``, in images, as for :class:`DirectLighting`.
     """
     draws_near_light = plan.draws_near_light if for_images else plan.near_light_in_derivatives
     media = build_media(scene, needs, plan, survey, readings, for_images, tracer)
     if settings.deterministic:
         media = media.by_quadrature()
     # Candidates would lengthen gradients by a tenth.
-    direct = DirectLighting(media, balls, resamples=for_images, bright=bright if for_images else None)
+    direct = DirectLighting(media, emitters, resamples=for_images, bright=bright if for_images else None)
     choice = SegmentInputs(direct, plan.scattering_points)
     if plan.segment in ("single_scattering", "scattering_quadrature"):
         with dr.suspend_grad():

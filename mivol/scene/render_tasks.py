@@ -64,8 +64,8 @@ class PreparedArrays:
         views: sensors of a ``batch``; None for another sensor.
         placements: numbers of boxes, grids and the scene (:func:`prepare_placements`); None while ``dr.freeze`` records.
         tracer: scene of the surfaces alone; None to trace the whole scene.
-        balls: where emitters are (:func:`mivol.transport.estimators.lighting.emitters.read_balls`); None while ``dr.freeze``
-            records.
+        emitters: weights and places of emitters (:func:`mivol.transport.estimators.lighting.emitters.read_emitters`); None
+            while ``dr.freeze`` records.
         bright: table for samples of the environment map, in images (:class:`BrightMap`).
         phases: the phase function of each medium, whose arrays Mitsuba hides from Dr.Jit.
         rays: the rays and weights of a sensor whose arrays Mitsuba hides (:func:`mivol.transport.path.film.sample_rays`); None
@@ -77,7 +77,7 @@ class PreparedArrays:
     views: mi.SensorPtr | None
     placements: mi.Float64 | None
     tracer: mi.Scene | None
-    balls: mi.Float | None
+    emitters: mi.Float | None
     bright: BrightMap | None
     phases: list[Phase] = field(default_factory=list)
     rays: list[tuple[mi.Ray3f, mi.Spectrum]] | None = None
@@ -224,7 +224,7 @@ class RenderTask(RecordedTask):
             needs = self.needs.with_views(self.survey, arrays.phases, self.layout.scales)
             if arrays.light is not None:
                 needs = replace(needs, media_light=MediaLight(*arrays.light))
-            made = arrays.readings, arrays.tracer, arrays.balls, arrays.bright
+            made = arrays.readings, arrays.tracer, arrays.emitters, arrays.bright
             return build_estimators(scene, needs, self.plan, self.settings, self.survey, self.for_images, *made)
 
     def samples(self, sensor: mi.Sensor, arrays: PreparedArrays, seed: mi.UInt32) -> RenderSamples:

@@ -27,6 +27,9 @@ FOLLOWED = ("data", "value")
 PLACES = ("position", "to_world")
 """Names of the parameters that place an emitter."""
 
+WEIGHT = "sampling_weight"
+"""Name of the parameter by which emitters are chosen: a number in Mitsuba."""
+
 SHAPE_PLACES = ("to_world", "vertex_positions", "vertex_normals", "vertex_texcoords", "control_points")
 """Names of the parameters that place a shape."""
 
@@ -51,7 +54,7 @@ class SceneState:
         values: the arrays that a recording follows, by their indices in Dr.Jit and with their shapes.
         others: all other arrays and numbers.
         of_sensor: the arrays and numbers of the sensor among both.
-        lamps, shapes: the places of the emitters, and those of shapes that a recording follows, among both.
+        lamps, shapes: the places and weights of the emitters, and the places of shapes that a recording follows, among both.
         scales: the scales of stock media, which are numbers, among ``values``.
         held: the arrays. Dr.Jit would give the index of a freed array to another array.
         differentiated: keys of the scene's parameters with gradients enabled, with their owners.
@@ -129,6 +132,10 @@ class SceneState:
             numbers = value if dr.is_array_v(value) else getattr(value, "matrix", None)
             if isinstance(value, float) and owner.class_name() in STOCK:
                 self.scales.append(value)
+                self._sort(owner, True, ((value,), (), False))
+                continue
+            if isinstance(value, float) and isinstance(owner, mi.Emitter) and key.rpartition(".")[2] == WEIGHT:
+                self.lamps.append((value,))
                 self._sort(owner, True, ((value,), (), False))
                 continue
             if numbers is None or not dr.is_jit_v(numbers):

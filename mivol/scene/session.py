@@ -56,7 +56,7 @@ from mivol.scene.stand_in import StandIn, evaluate_samplers, reset_sampler
 from mivol.scene.survey import SceneSurvey, survey_scene
 from mivol.scene_graph import list_values, put_value, traverse, traverse_children
 from mivol.transport.estimators.lighting.bright_map import BrightMap, MapReading
-from mivol.transport.estimators.lighting.emitters import read_balls
+from mivol.transport.estimators.lighting.emitters import read_emitters
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.line_integrals.aovs import integrate_aovs
 from mivol.transport.media.medium_view import MediumView
@@ -375,7 +375,7 @@ class Session:
             distances = find_emitter_distances(scene, boundaries, media)
             if list(map(distance_class, distances)) != list(map(distance_class, needs.emitter_distances)):
                 return None
-            arrays = replace(arrays, balls=read_balls(scene))
+            arrays = replace(arrays, emitters=read_emitters(scene))
         layout = known.layout
         if is_placed_anew:
             placements, layout = prepare_placements(viewed, survey.size, known.plan.shadow_nodes)
@@ -404,9 +404,9 @@ class Session:
             placements, layout = known.arrays.placements, known.layout
         else:
             placements, layout = prepare_placements(needs, survey.size, plan.shadow_nodes)
-        readings, balls = read_parts(needs, plan, survey, for_images), None if is_recording() else read_balls(scene)
+        readings, emitters = read_parts(needs, plan, survey, for_images), None if is_recording() else read_emitters(scene)
         light, bright = _read_table(needs), self._read_bright_map(scene, for_images)
-        arrays = PreparedArrays(readings, light, find_batch_views(sensor), placements, survey.usable_tracer, balls, bright)
+        arrays = PreparedArrays(readings, light, find_batch_views(sensor), placements, survey.usable_tracer, emitters, bright)
         self._surveyed.views = needs.views if for_images and not is_recording() else ()
         facts = replace(needs, views=(), media_light=None)
         made = survey, facts, plan, arrays, settings, layout

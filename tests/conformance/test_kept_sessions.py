@@ -14,7 +14,7 @@ from mivol.scene.kept_sessions import MAX_KEPT
 from mivol.threads import set_thread_count
 from scenes import sky
 
-pytestmark = pytest.mark.usefixtures("cpu_back_end")
+pytestmark = pytest.mark.usefixtures("cpu_back_end", "shared_sessions")
 
 KEY = "smoke.interior_medium.sigma_t.data"
 

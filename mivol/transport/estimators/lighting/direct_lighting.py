@@ -175,7 +175,7 @@ class DirectLighting:
 
     Args:
         media: media and surfaces of the scene.
-        balls: numbers of :func:`mivol.transport.estimators.lighting.emitters.read_balls`; by default read from the scene.
+        emitters: numbers of :func:`mivol.transport.estimators.lighting.emitters.read_emitters`; by default read from the scene.
         resamples: whether samples of lamps with hidden sides are drawn from candidates.
         bright: as of :class:`SceneEmitters`.
 
@@ -186,9 +186,9 @@ class DirectLighting:
     shadow_table: TransmittanceGrid | None
 
     def __init__(
-        self, media: SceneMedia, balls: mi.Float | None = None, resamples: bool = True, bright: BrightMap | None = None
+        self, media: SceneMedia, emitters: mi.Float | None = None, resamples: bool = True, bright: BrightMap | None = None
     ) -> None:
-        self.media, self.shadow_table, self._balls = media, None, balls
+        self.media, self.shadow_table, self._numbers = media, None, emitters
         self._resamples, self._bright = resamples, bright
 
     @cached_property
@@ -215,7 +215,7 @@ class DirectLighting:
             return self._find_emitters(distance)
 
     def _find_emitters(self, distance: str) -> SceneEmitters:
-        made = self._balls, self.media.lit_box, self._resamples, self._bright
+        made = self._numbers, self.media.lit_box, self._resamples, self._bright
         return SceneEmitters(self.media.scene, self.media.start is not None, distance, *made)
 
     def sample_emitter(

@@ -217,7 +217,11 @@ class EmitterDistribution:
 
 
 def tabulate_emitters(
-    emitters: mi.EmitterPtr, centre: mi.Point3f, half: mi.Vector3f, balls: Sequence[Sequence[mi.Float] | None]
+    emitters: mi.EmitterPtr,
+    centre: mi.Point3f,
+    half: mi.Vector3f,
+    balls: Sequence[Sequence[mi.Float] | None],
+    weights: mi.Float,
 ) -> EmitterGrid:
     """Estimate the light of emitters in the cells of a grid.
 
@@ -225,6 +229,7 @@ def tabulate_emitters(
         emitters: the emitters.
         centre, half: centre and half edges of the box [length].
         balls: centre and radius of each emitter [length], None at infinity. If all are at infinity, one cell is enough.
+        weights: sampling weight of each emitter [1].
 
     Cost: at most ``MAX_SAMPLES`` emitter samples.
     """
@@ -235,6 +240,9 @@ def tabulate_emitters(
     points = CELL_POINTS if is_near else SINGLE_CELL_POINTS
     # -- The fluence ---------------------------------------------------------------------------------------------------------
     lane = dr.arange(mi.UInt32, cells**3 * count * points)
+    if not is_near:
+        # A sun gives the same light everywhere. A replay would guess the number of lanes by the sizes of tables.
+        lane += dr.opaque(mi.UInt32, 0, dr.width(lane))
     point, cell = mi.Float(lane % points), lane // (points * count)
     it = dr.zeros(mi.Interaction3f, dr.width(lane))
     it.p = centre + half * _draw_place(cell, point, cells)
@@ -247,7 +255,7 @@ def tabulate_emitters(
     rms = dr.sqrt(dr.block_sum(dr.square(fluence), points) / points)
     # -- Weights -------------------------------------------------------------------------------------------------------------
     entry = dr.arange(mi.UInt32, cells**3 * count)
-    scale = dr.detach(dr.gather(mi.EmitterPtr, emitters, entry % count).sampling_weight())
+    scale = dr.gather(mi.Float, weights, entry % count)
     weight, everywhere = rms * scale, dr.zeros(mi.Float, count)
     dr.scatter_add(everywhere, weight, entry % count)
     total = dr.gather(mi.Float, dr.block_sum(weight, count), entry // count)

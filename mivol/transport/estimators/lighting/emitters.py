@@ -10,6 +10,7 @@ References: Kulla & Fajardo 2012 (equiangular sampling); Talbot et al. 2005 (res
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -39,7 +40,7 @@ __all__ = [
     "EquiangularSampler",
     "make_ball_sampler",
     "make_equiangular_sampler",
-    "read_balls",
+    "read_emitters",
 ]
 
 
@@ -63,7 +64,7 @@ class SceneEmitters:
         scene: Mitsuba's scene.
         from_camera: media surround the camera, so rays scatter light from their origin on.
         distance: ``near`` for the emitters with a position alone, ``far`` for the emitters at infinity alone, ``any`` for all.
-        balls: numbers of :func:`read_balls`; by default read from the scene.
+        numbers: of :func:`read_emitters`; by default read from the scene.
         lit_box: corners of :func:`find_lit_box`; by default found in the scene.
         resamples: whether samples of lamps with hidden sides are drawn from candidates.
         bright: table for samples of the environment map; by default Mitsuba's ``envmap`` draws them.
@@ -81,12 +82,12 @@ class SceneEmitters:
         scene: mi.Scene,
         from_camera: bool = False,
         distance: str = "any",
-        balls: mi.Float | None = None,
+        numbers: mi.Float | None = None,
         lit_box: np.ndarray | None = None,
         resamples: bool = True,
         bright: BrightMap | None = None,
     ) -> None:
-        placed = list(zip(scene.emitters(), _find_balls(scene, balls), strict=True))
+        placed = list(zip(scene.emitters(), _find_balls(scene, numbers), strict=True))
         if distance != "any":
             placed = [(e, ball) for e, ball in placed if (ball is not None) == (distance == "near")]
         emitters, delta = [e for e, _ in placed], int(mi.EmitterFlags.Delta)
@@ -104,10 +105,10 @@ class SceneEmitters:
         # Dr.Jit records a call for every emitter of the scene, chosen or not.
         self.are_evaluated = all(e.class_name() != PARALLEL_AREA for e in scene.emitters())
         if self.sampled:
-            self._table = _EmitterTable.of(scene, self.sampled, self._balls)
+            self._table = _EmitterTable.of(scene, self.sampled, self._balls, numbers)
             several = sum(ball is not None for ball in self._balls) > 1
             box = self._table.find_varied_box(find_lit_box(scene) if lit_box is None else lit_box, several)
-            self._grid = tabulate_emitters(self._table.pointers, *box, self._balls)
+            self._grid = tabulate_emitters(self._table.pointers, *box, self._balls, self._table.weights)
 
     def number_of(self, emitter: mi.EmitterPtr) -> mi.UInt32:
         """The index of an emitter among those ``sampled``."""
@@ -259,26 +260,31 @@ class _EmitterTable:
         pointers: the emitters as an array.
         numbers: number of each emitter by its index in Dr.Jit's registry, and a number beyond all emitters for others.
         balls: centre and radius of each emitter, and whether its distance is finite, one array for each.
+        weights: sampling weight of each emitter.
     """
 
     emitters: list[mi.Emitter]
     pointers: mi.EmitterPtr
     numbers: mi.UInt32
     balls: list[mi.Float]
+    weights: mi.Float
 
     @classmethod
-    def of(cls, scene: mi.Scene, emitters: list[mi.Emitter], balls: list[list[mi.Float] | None]) -> _EmitterTable:
+    def of(
+        cls, scene: mi.Scene, emitters: list[mi.Emitter], balls: list[list[mi.Float] | None], read: mi.Float | None
+    ) -> _EmitterTable:
         """Make the table.
 
         Args:
             scene: Mitsuba's scene.
             emitters: the emitters, in the order of the scene.
             balls: centre and radius of each; None for an emitter at infinity.
+            read: numbers of :func:`read_emitters`; None to read them here.
         """
         count, everyone = len(emitters), scene.emitters()
         if count == 1:
             (only,) = emitters
-            return cls(emitters, mi.EmitterPtr(only), mi.UInt32(0), [])
+            return cls(emitters, mi.EmitterPtr(only), mi.UInt32(0), [], mi.Float(1))
         chosen = {id(e) for e in emitters}
         left_out = [k for k, e in enumerate(everyone) if id(e) not in chosen]
         number = place = dr.arange(mi.UInt32, count)
@@ -294,8 +300,9 @@ class _EmitterTable:
         rows = zip(*(far if b is None else b for b in balls), strict=True)
         finite = [dr.opaque(mi.Float, float(b is not None)) for b in balls]
         columns = [join_arrays(list(row)) for row in (*rows, finite)]
-        dr.eval(pointers, numbers, columns)
-        return cls(emitters, pointers, numbers, columns)
+        weights = pointers.sampling_weight() if read is None else dr.gather(mi.Float, read, place)
+        dr.eval(pointers, numbers, columns, weights)
+        return cls(emitters, pointers, numbers, columns, weights)
 
     def pointer(self, number: mi.UInt32) -> mi.EmitterPtr:
         """The emitter of a number."""
@@ -383,12 +390,14 @@ def find_bounding_ball(emitter: mi.Emitter) -> list[float] | None:
     return [*((low + high) / 2), float(np.linalg.norm(high - low) / math.sqrt(12))]
 
 
-def read_balls(scene: mi.Scene) -> mi.Float | None:
-    """Centre and radius of each emitter that has a position (:func:`find_bounding_ball`), flat, as an input of recordings.
-    None without such emitters.
+def read_emitters(scene: mi.Scene) -> mi.Float | None:
+    """Sampling weights of the emitters, then centre and radius of each emitter with a position (:func:`find_bounding_ball`),
+    flat, as an input of recordings. None without emitters.
     """
-    balls = [ball for e in scene.emitters() if (ball := find_bounding_ball(e)) is not None]
-    return mi.Float(copy_aligned(np.array(balls, np.float32).ravel())) if balls else None
+    emitters = scene.emitters()
+    balls = [ball for e in emitters if (ball := find_bounding_ball(e)) is not None]
+    numbers = [*(e.sampling_weight() for e in emitters), *itertools.chain(*balls)]
+    return mi.Float(copy_aligned(np.array(numbers, np.float32))) if numbers else None
 
 
 def _find_balls(scene: mi.Scene, numbers: mi.Float | None) -> list[list[mi.Float] | None]:
@@ -396,14 +405,14 @@ def _find_balls(scene: mi.Scene, numbers: mi.Float | None) -> list[list[mi.Float
 
     Args:
         scene: Mitsuba's scene.
-        numbers: of :func:`read_balls`; None to read them here.
+        numbers: of :func:`read_emitters`; None to read them here.
     """
     balls = [find_bounding_ball(e) for e in scene.emitters()]
     if numbers is None:
         return [None if ball is None else [dr.opaque(mi.Float, v) for v in ball] for ball in balls]
     # Outside of recordings, Dr.Jit copies the number at a literal index at once.
     start = mi.UInt32(0) if is_recording() else dr.opaque(mi.UInt32, 0)
-    firsts = np.cumsum([0, *(0 if ball is None else len(ball) for ball in balls)])
+    firsts = np.cumsum([len(balls), *(0 if ball is None else len(ball) for ball in balls)])
     return [
         None if ball is None else [dr.gather(mi.Float, numbers, start + int(first + k)) for k in range(len(ball))]
         for ball, first in zip(balls, firsts[:-1], strict=True)
