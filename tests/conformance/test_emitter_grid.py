@@ -13,7 +13,7 @@ from scattering_scenes import assert_same_images, close_up, fog, mivol, moments,
 from volpath_scenes import LEAK, area, floor, panorama, textured
 
 from mivol.transport.estimators.lighting.emitter_grid import EVEN_SHARE, MARGIN, MAX_CELLS, MEAN_SHARE
-from mivol.transport.estimators.lighting.emitters import SceneEmitters
+from mivol.transport.estimators.lighting.emitters import SceneEmitters, read_emitters
 
 STRONG, WEAK = [1.5, -1.0, 1.8], [-1.6, 0.9, 0.4]
 ROUNDING = 2.0**-20
@@ -141,12 +141,15 @@ def test_the_density_of_a_direction_is_the_density_of_its_sample() -> None:
 
 
 def test_weights_of_the_scene_count() -> None:
-    """A ``sampling_weight`` of 3 beside 1 multiplies the probability of a lamp that gives as much light; 0 leaves it out."""
+    """A ``sampling_weight`` of 3 beside 1 multiplies the probability of a lamp that gives as much light; 0 leaves it out.
+    Also in the array that recordings take, behind a sky that is not sampled and another weight.
+    """
     for weight in (3.0, 0.0):
         far = {"a": sun([0, 0, -1])[0] | {"sampling_weight": weight}, "b": sun([0, 1, 0])[0]}
-        found = emitters_of(far)
-        seen = sorted(probabilities(found, found._grid.at_point(mi.Point3f(0))).ravel())
-        assert seen == pytest.approx(sorted([weight / (weight + 1), 1 / (weight + 1)]), abs=ROUNDING)
+        scene = scene_of({"sky": {"type": "constant", "sampling_weight": 7.0}, **far})
+        for found in (SceneEmitters(scene), SceneEmitters(scene, numbers=read_emitters(scene))):
+            seen = probabilities(found, found._grid.at_point(mi.Point3f(0))).ravel()
+            assert seen == pytest.approx([weight / (weight + 1), 1 / (weight + 1)], abs=ROUNDING)
 
 
 # -- Means and variance --------------------------------------------------------------------------------------------------

@@ -474,6 +474,8 @@ def test_the_sampling_weight_of_an_emitter_is_followed(distance: str) -> None:
         pair.params["second.sampling_weight"] = weight
         pair.params.update()
         pair.assert_same(call)
+        first = np.array(mi.render(pair.scene, integrator=mi.load_dict(mivol(max_depth=3)), seed=call, spp=2))
+        assert np.array_equal(pair.images(call)[0], first)
         assert_close(pair.gradients(INSIDE + "sigma_t.data", call))
         counts.append(pair.recordings.count)
     assert counts[2] == counts[5] > 0 and not any(pair.recordings.failures.values())
