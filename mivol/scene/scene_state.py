@@ -100,9 +100,9 @@ class SceneState:
         return (*self.others, shapes, followed)
 
     @property
-    def sensor_facts(self) -> tuple:
-        """What the samples of the sensor depend on besides arrays."""
-        return self.others[-1]
+    def sensor_kind(self) -> str | None:
+        """The kind of the sensor (:func:`mivol.scene.stand_in.describe_kind`)."""
+        return self.others[-1][-1]
 
     def is_same(self, other: SceneState) -> bool:
         """Whether no parameter differs, and the sensor is the same."""
@@ -252,11 +252,8 @@ def _describe_sensor(sensor: mi.Sensor) -> tuple:
         sensor.class_name(),
         sensor.needs_aperture_sample(),
         sensor.get_medium().ptr if sensor.get_medium() is not None else None,
-        tuple(film.size()),
-        tuple(film.crop_size()),
-        tuple(film.crop_offset()),
-        film.class_name(),
-        str(film.rfilter()),
+        str(film),
         sampler.class_name(),
         sampler.sample_count(),
+        describe_kind(sensor),
     )

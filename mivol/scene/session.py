@@ -78,7 +78,7 @@ class _SurveyedScene:
         is_joined: whether the scene and its tracer share their arrays.
         sources: the objects of whose parameters plugins compute values, by pointer; None before the first gradient.
         opened: the plans for images (True) and for derivatives (False).
-        stand_ins: sensors with their stand-ins, by pointer and facts. A freed sensor could leave its pointer to another sensor.
+        stand_ins: of the sensors, by kind. No sensor is held: a user may load a new one in each step.
         views: of the last image, for its derivatives; views kept longer would keep the derivatives of an earlier step.
         map: the bright part of the environment map.
         number: tells the recordings of scenes apart.
@@ -89,7 +89,7 @@ class _SurveyedScene:
     is_joined: bool = False
     sources: set[int] | None = None
     opened: dict[bool, PlannedScene] = field(default_factory=dict)
-    stand_ins: dict[tuple, tuple[mi.Sensor, StandIn | None]] = field(default_factory=dict)
+    stand_ins: dict[str, StandIn] = field(default_factory=dict)
     views: tuple[MediumView, ...] = ()
     map: MapReading = field(default_factory=MapReading)
     number: int = field(default_factory=itertools.count().__next__)
@@ -233,7 +233,7 @@ class Session:
         if is_recording() or opened.unrecorded is not None:
             return make()(*given)
         self._join_arrays(scene, opened.arrays.tracer)
-        stand_in = self._find_stand_in(sensor, opened.state)
+        stand_in = self._find_stand_in(sensor, opened.state.sensor_kind)
         if stand_in is not None:
             stand_in.meet(sensor, scene.sensors(), self.aovs)
             stand_in.show(sensor, opened.state.of_sensor)
@@ -284,12 +284,14 @@ class Session:
         self._scenes.sort(key=lambda one: one.is_of(parts))
         return bool(self._scenes) and self._surveyed.is_of(parts)
 
-    def _find_stand_in(self, sensor: mi.Sensor, state: SceneState) -> StandIn | None:
+    def _find_stand_in(self, sensor: mi.Sensor, kind: str | None) -> StandIn | None:
         """The camera to render in the place of a sensor; None for the sensor itself."""
-        key, known = (sensor.ptr, state.sensor_facts), self._surveyed.stand_ins
-        if key not in known:
-            known[key] = sensor, StandIn.find(sensor)
-        return known[key][1]
+        known = self._surveyed.stand_ins
+        if kind is None:
+            return None
+        if kind not in known:
+            known[kind] = StandIn.find(sensor, kind)
+        return known[kind]
 
     def _reset(self, sensor: mi.Sensor) -> None:
         """Bring the film and the sampler into a state that does not depend on what was rendered before.

@@ -148,11 +148,8 @@ class StandIn:
     _known: ClassVar[WeakValueDictionary[tuple[str, str], StandIn]] = WeakValueDictionary()
 
     @classmethod
-    def find(cls, sensor: mi.Sensor) -> StandIn | None:
-        """The stand-in of a camera, shared by all integrators; None if the camera has no stand-in."""
-        kind = describe_kind(sensor)
-        if kind is None:
-            return None
+    def find(cls, sensor: mi.Sensor, kind: str) -> StandIn:
+        """The stand-in of a camera of a kind (:func:`describe_kind`), shared by all integrators."""
         known = cls._known.get((mi.variant(), kind))
         if known is None:
             known = cls._known[mi.variant(), kind] = cls(sensor)
@@ -231,8 +228,9 @@ class StandIn:
             others: cameras to be rendered perhaps; cameras of the same kind are met as well.
             names: of the AOVs.
         """
-        if sensor.ptr in self._met:
+        if sensor.ptr in self._met and not _has_no_image(sensor.film()):
             return
+        self._met.discard(sensor.ptr)
         kind = describe_kind(sensor)
         new = [one for one in (sensor, *others) if one.ptr not in self._met and describe_kind(one) == kind]
         if len(new) * math.prod(int(n) for n in self.camera.film().crop_size()) > MET_PIXELS:

@@ -9,6 +9,7 @@ import contextlib
 import gc
 import itertools
 import re
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -918,6 +919,21 @@ def test_the_cameras_of_a_scene_are_recorded_once(kind: str) -> None:
     assert pair.recordings.count == 1
 
 
+@pytest.mark.parametrize("kind", cases(LENSES, slow=("thinlens",)))
+def test_a_new_camera_in_each_step_is_not_recorded(kind: str) -> None:
+    """Nor held: its parts may be freed, and leave their places in memory to the next."""
+    pair, counts, eyes = Pair(smoke_under(sky=sky(0.7)), 3), [], []
+    for call in range(8):
+        eye = camera((4 * np.sin(call), -4 * np.cos(call), 1.0), (0.0, 0.0, 0.0), res=6)
+        eye.pop("fov")
+        sensor = mi.load_dict(eye | {"type": kind, **LENSES[kind][0]})
+        pair.assert_same(call, sensor=sensor)
+        counts.append(pair.recordings.count)
+        eyes = [*eyes[:2], sensor]
+    assert counts[4] == counts[7] > 0
+    assert sys.getrefcount(eyes[0]) == sys.getrefcount(object()) + 1
+
+
 @pytest.mark.slow
 def test_cameras_of_two_kinds_in_turns_keep_their_recordings() -> None:
     """A number of the floor becomes an array on the way: it has not moved for either camera."""
@@ -959,7 +975,7 @@ def test_a_stand_in_has_the_rays_of_the_given_camera(kind: str) -> None:
     to_world = mi.ScalarTransform4f().look_at([3, -4, 1], [0.2, 0.1, 0], [0, 0, 1])
     for number, lens in enumerate(LENSES[kind]):
         sensor = mi.load_dict({"type": kind, "to_world": to_world, "film": {"type": "hdrfilm", **crop}, **lens})
-        stand_in = StandIn.find(sensor)
+        stand_in = StandIn.find(sensor, describe_kind(sensor))
         stand_in.show(sensor, [number])
         numbers = mi.Point2f(0.1, [0.2, 0.7]), mi.Point2f([0.9, 0.3], 0.4)
         (found, weight), (truth, its_weight) = (
@@ -1046,9 +1062,10 @@ def test_a_stand_in_has_a_film_like_the_given_one(pixel_format: str) -> None:
     size = {"width": 8, "height": 6, "crop_width": 4, "crop_height": 3, "crop_offset_x": 1, "crop_offset_y": 2}
     film = {"type": "hdrfilm", "rfilter": {"type": "mitchell"}, "sample_border": True, "pixel_format": pixel_format, **size}
     sensor = mi.load_dict({"type": "perspective", "film": film, "sampler": {"type": "independent", "sample_count": 3}})
-    stand_in = StandIn.find(sensor)
-    assert describe_kind(stand_in.camera) == describe_kind(sensor)
-    assert StandIn.find(sensor) is stand_in and stand_in.camera.film().ptr != sensor.film().ptr
+    kind = describe_kind(sensor)
+    stand_in = StandIn.find(sensor, kind)
+    assert describe_kind(stand_in.camera) == kind
+    assert StandIn.find(sensor, kind) is stand_in and stand_in.camera.film().ptr != sensor.film().ptr
 
 
 @pytest.mark.parametrize(("albedo", "between", "readings"), [(0.8, False, 1), (0.8, True, 2), (0.0, False, 2)])
