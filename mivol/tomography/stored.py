@@ -305,10 +305,12 @@ class LayerMatrix:
 
     def _multiply(self, layers: np.ndarray) -> np.ndarray:
         """Multiply layers (layers, columns) float32: (layers, rows)."""
-        count, width = len(layers), min(LAYERS_AT_ONCE, 1 << (len(layers) - 1).bit_length())
-        pack, multiply = _record_products(width)
-        given, result = mi.Float(np.ascontiguousarray(layers).reshape(-1)), np.empty((count, len(self.first)), np.float32)
-        for first in range(0, count, width):
+        count, result = len(layers), np.empty((len(layers), len(self.first)), np.float32)
+        given = mi.Float(np.ascontiguousarray(layers).reshape(-1))
+        for first in range(0, count, LAYERS_AT_ONCE):
+            # The last layers may be few.
+            width = min(LAYERS_AT_ONCE, 1 << (count - first - 1).bit_length())
+            pack, multiply = _record_products(width)
             packed = dr.empty(mi.Float, width * self.width)
             numbers = [dr.opaque(mi.UInt32, n) for n in (first, count, self.width)]
             products = multiply(self._rows, pack(packed, given, *numbers))
