@@ -89,13 +89,14 @@ def run_experiment(context: RunContext) -> Path:
     return written
 
 
-MOST_SHARE_OF_PAGES = 0.02
-"""Largest share of the time of a fit that its pages take while it runs."""
+MOST_SHARE_OF_PAGES, FIRST_PAGE = 0.02, 1.0
+"""Largest share of the time of a fit that its pages take while it runs, and the time that the first page is expected to take
+[s]."""
 
 
 class LivePage:
     """The page of a fit while it runs: curves so far, progress, pictures of the kind, and a table of the workers. Without a
-    cluster, only kinds with ``has_live_page`` have one; other pages are written at the end."""
+    cluster, only long fits of kinds with ``has_live_page`` have one; other pages are written at the end."""
 
     def __init__(self, kind: FitKind, run: RunFolder, workers: Distribution | None) -> None:
         self.kind, self.run, self.workers = kind, run, workers
@@ -113,10 +114,9 @@ class LivePage:
     def show(self, fit: Fit, iterations: int) -> None:
         """Write record and page, if they are due."""
         start = time.monotonic()
-        workers = self.workers
-        if (workers is None and not self.kind.has_live_page) or start < self.due:
+        if start < self.due or not self._is_worth_a_page(fit, iterations):
             return
-        record = self.run.record
+        record, workers = self.run.record, self.workers
         said = f"{fit.next_iteration} of {iterations} iterations" + (f", {workers.describe()}" if workers else "")
         shown = msgspec.structs.replace(
             record,
@@ -129,6 +129,13 @@ class LivePage:
         write_page(self.run.path)
         self.has_page, end = True, time.monotonic()
         self.due = end + max(SECONDS_BETWEEN_PAGES, (end - start) / MOST_SHARE_OF_PAGES)
+
+    def _is_worth_a_page(self, fit: Fit, iterations: int) -> bool:
+        """Whether the fit has a page while it runs; a short fit without a cluster ends before a page would help."""
+        if self.workers is not None or self.has_page:
+            return True
+        expected = fit.seconds * iterations / max(fit.next_iteration, 1)
+        return self.kind.has_live_page and MOST_SHARE_OF_PAGES * expected >= FIRST_PAGE
 
 
 def complete_fit(

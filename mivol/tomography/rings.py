@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.sparse import diags_array, eye_array
 from scipy.sparse.linalg import splu, spsolve
-from scipy.stats import t
+from scipy.special import stdtrit
 
 from mivol.errors import MivolError
 from mivol.tomography.preprocess import LightDrift, Transmission, fit_light_drift, interpolate_gaps
@@ -70,7 +70,8 @@ def remove_rings(y: np.ndarray, weights: np.ndarray, method: str, width: int) ->
     bends. About half of a gain with a period of w along the detector is removed, and more of a shorter one.
 
     With 48 views or more, o is also found in arcs of the scan. A gain is the same in all arcs; details of the object move. So o
-    is reduced to its share on which the arcs agree, and to 0 in a row whose arcs agree only by chance (empirical Bayes).
+    is reduced to its share on which the arcs agree, and to 0 in a row whose arcs agree only by chance (empirical Bayes). At a
+    width of ``FIRST_WIDTH`` they must agree too: gains of pixels do, and few details of the object.
 
     ``"sort"`` replaces the value of rank k by the median of :math:`s_{k,\cdot}` over w columns; the outermost column continues
     beyond the edges. A row in which ``"gain"`` finds nothing keeps its values.
@@ -108,20 +109,38 @@ def _subtract_gains(y: np.ndarray, width: int) -> np.ndarray:
     """A row (views, cols) without the steps of constant gains."""
     offsets, arcs = _find_offsets(y, width), min(ARCS, len(y) // VIEWS_OF_ARC)
     if arcs >= FEWEST_ARCS:
-        offsets *= _share_of_gains(np.stack([_find_offsets(part, width) for part in np.array_split(y, arcs)]))
+        parts = np.array_split(y, arcs)
+        offsets_of_arcs, narrow = (np.stack([_find_offsets(part, w) for part in parts]) for w in (width, min(width, FIRST_WIDTH)))
+        offsets *= _share_of_gains(offsets_of_arcs, _exceeds_chance(narrow))
     return y - offsets
 
 
-def _share_of_gains(offsets: np.ndarray) -> np.ndarray:
-    """Share of each column's offset that gains explain, from its offsets in arcs of the scan (arcs, cols).
+def _exceeds_chance(offsets: np.ndarray) -> bool:
+    """Whether the offsets of arcs of the scan (arcs, cols) agree better than by chance.
 
     A gain is the same in all arcs; a detail of the object moves to other columns. So the variance of the mean offset is that
-    between arcs.
+    between arcs. Gains of pixels also show in a narrow width, in which neighbouring offsets are independent and few details of
+    the object are left.
     """
-    found, variances = np.mean(offsets, axis=0), np.var(offsets, axis=0, ddof=1) / len(offsets)
-    excess = found**2 - variances
-    by_chance = GAIN_DEVIATIONS * excess.std() / np.sqrt(len(excess))
-    return _share_above_chance(found, variances, excess.mean() if excess.mean() > by_chance else 0.0, len(offsets))
+    excess = _excess(offsets)
+    return bool(excess.mean() > GAIN_DEVIATIONS * excess.std() / np.sqrt(len(excess)))
+
+
+def _excess(offsets: np.ndarray) -> np.ndarray:
+    """The squares of the mean offsets of arcs (arcs, cols), less the variances of their errors: (cols,)."""
+    return np.mean(offsets, axis=0) ** 2 - np.var(offsets, axis=0, ddof=1) / len(offsets)
+
+
+def _share_of_gains(offsets: np.ndarray, have_all: bool) -> np.ndarray:
+    """Share of each column's offset that gains explain, from its offsets in arcs of the scan (arcs, cols).
+
+    Args:
+        offsets: in arcs of the scan.
+        have_all: whether all columns have gains; else only single ones, each above chance.
+    """
+    variances = np.var(offsets, axis=0, ddof=1) / len(offsets)
+    true = max(_excess(offsets).mean(), 0.0) if have_all else 0.0
+    return _share_above_chance(np.mean(offsets, axis=0), variances, true, len(offsets))
 
 
 def _share_above_chance(found: np.ndarray, variances: np.ndarray, true: float, arcs: int) -> np.ndarray:
@@ -145,7 +164,7 @@ def _share_above_chance(found: np.ndarray, variances: np.ndarray, true: float, a
     # Arcs of a noiseless scan may agree to rounding.
     errors = np.maximum(uniform_filter1d(variances, ERROR_COLUMNS, mode="nearest"), ROUNDING**2)
     # Few arcs may agree by chance in a few neighbours: an error counts as at least the median of all.
-    is_own = squares > t.isf(COLUMN_CHANCE / 2, (arcs - 1) * ERROR_COLUMNS) ** 2 * np.maximum(errors, np.median(variances))
+    is_own = squares > stdtrit((arcs - 1) * ERROR_COLUMNS, COLUMN_CHANCE / 2) ** 2 * np.maximum(errors, np.median(variances))
     own = np.where(is_own, 1 - errors / np.where(is_own, squares, 1), 0)
     return np.maximum(true / (true + errors), own)
 

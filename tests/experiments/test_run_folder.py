@@ -59,8 +59,9 @@ def page_of_a_kind(has_live_page: bool) -> SimpleNamespace:
 
 
 def test_the_page_of_a_scan_is_live(tmp_path: Path) -> None:
-    """Without a cluster too, after some seconds, with pictures and the errors so far."""
-    fit = SimpleNamespace(next_iteration=2, seconds=2.0)
+    """Without a cluster too, after some seconds, with pictures and the errors so far; a fit of less than 50 seconds is too
+    short for a page."""
+    short, fit = (SimpleNamespace(next_iteration=2, seconds=seconds) for seconds in (2.4, 2.6))
     run = folder(tmp_path)
     with LivePage(page_of_a_kind(has_live_page=True), run, None) as page, run.at_work():
         run.begin(0)
@@ -69,6 +70,8 @@ def test_the_page_of_a_scan_is_live(tmp_path: Path) -> None:
         page.show(fit, 40)
         assert not (run.path / "report.html").exists()  # too early
         page.due = 0.0
+        page.show(short, 40)
+        assert not (run.path / "report.html").exists()
         page.show(fit, 40)
         said = (run.path / "report.html").read_text()
         assert all(words in said for words in ("2 of 40 iterations<", "slices so far", "Residual", REFRESH))

@@ -16,6 +16,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.optim.projections.linear_problems import (
+    GRAZED,
     LeastSquares,
     PoissonCounts,
     SmoothedTV,
@@ -25,6 +26,7 @@ from mivol.optim.projections.linear_problems import (
     dot,
     flat_weights,
     flatten,
+    map_blocks,
     ray_lengths,
     reciprocal,
     start_field,
@@ -179,9 +181,7 @@ def projected_cg(problem: LeastSquares, state: SolverState | None = None, precon
             step = _descend(problem, weigh, sample, state.x, g, _scale_descent(problem, state.x, g, diagonal))
         if step is None:
             return
-        x, r = np.add(state.x, step[0], out=step[0]), state.memory["residual"] - step[1]
-        if problem.nonnegative:
-            np.maximum(x, 0, out=x)  # rounding: the step ends in the domain
+        x, r = _move(problem, state.x, step[0]), state.memory["residual"] - step[1]
         state = _ls_state(problem, x, state.iteration + 1, r, {"residual": r, **found})
         yield state
 
@@ -191,38 +191,66 @@ def _direction(
 ) -> dict[str, np.ndarray] | None:
     """The conjugate direction, and memory for the next direction; None at the minimum."""
     x, memory = state.x, state.memory
-    g = problem.A.T @ weigh(memory["residual"])
-    np.negative(g, out=g)
+    g = problem.A.T @ -weigh(memory["residual"])
     direction = _scale_descent(problem, x, g, _add_majoriser(problem, x, g, data_diagonal))
     gz = -dot(g, direction)
     if not gz > 0:
         return None
     if "direction" in memory:
         beta = np.asarray(max(0.0, (gz + dot(memory["gradient"], direction)) / float(memory["gz"])), x.dtype)
-        for part in blocks(len(x)):
+
+        def add_last(part: slice) -> None:
             last = beta * memory["direction"][part]
-            direction[part] += last * ((x[part] > 0) | (g[part] < 0)) if problem.nonnegative else last
+            if problem.nonnegative:
+                last *= _is_free(x[part], g[part])
+            direction[part] += last
+
+        map_blocks(add_last, len(x))
     return {"direction": direction, "gradient": g, "gz": np.asarray(gz)}
 
 
 def _add_majoriser(problem: LeastSquares, x: np.ndarray, g: np.ndarray, data_diagonal: np.ndarray | None) -> np.ndarray:
     """Add the gradient of the prior to ``g``; return the diagonal of the majoriser, 1 without a preconditioner."""
-    diagonal = np.zeros_like(g) if data_diagonal is None else data_diagonal.copy()
-    if problem.prior:
-        problem.prior.add_derivatives(x, g, diagonal)
-    if data_diagonal is None:
-        diagonal.fill(1)
-    return diagonal
+    diagonal = np.ones_like(g) if data_diagonal is None else data_diagonal
+    total = problem.prior.add_derivatives(x, g, diagonal) if problem.prior else diagonal.copy()
+    return diagonal if data_diagonal is None else total
+
+
+def _is_free(x: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """Whether voxels may move along the negative gradient, with 0 as bound."""
+    free = x > 0
+    free |= g < 0
+    return free
 
 
 def _scale_descent(problem: LeastSquares, x: np.ndarray, g: np.ndarray, diagonal: np.ndarray) -> np.ndarray:
-    """The negative gradient over the diagonal, in whose place it is written; 0 at voxels that the bound holds."""
-    largest = float(np.max(diagonal, initial=0.0))
-    for part in blocks(len(x)):
-        diagonal[part] = g[part] * -reciprocal(diagonal[part], largest)
+    """The negative gradient over the diagonal, in whose place it is written; 0 at voxels that the bound holds, or grazed."""
+    floor = np.asarray(GRAZED * float(np.max(diagonal, initial=0.0)) or 1, g.dtype)
+
+    def scale(part: slice) -> None:
+        step = diagonal[part]
+        free = step > floor
         if problem.nonnegative:
-            diagonal[part] *= (x[part] > 0) | (g[part] < 0)
+            free &= _is_free(x[part], g[part])
+        np.maximum(step, floor, out=step)
+        np.divide(g[part], step, out=step)
+        np.negative(step, out=step)
+        step *= free
+
+    map_blocks(scale, len(x))
     return diagonal
+
+
+def _move(problem: LeastSquares, x: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """``x + step``, in the place of the step."""
+
+    def add(part: slice) -> None:
+        step[part] += x[part]
+        if problem.nonnegative:
+            np.maximum(step[part], 0, out=step[part])  # rounding: the step ends in the domain
+
+    map_blocks(add, len(x))
+    return step
 
 
 SAMPLED, MIN_SAMPLES = 8, 2
@@ -244,19 +272,25 @@ def _descend(
         if lowest is None:
             return None
         rough, image = lowest
-        step = np.asarray(rough, x.dtype) * direction
-        if not problem.nonnegative or _stays_nonnegative(x, 1, step):
-            return step, np.asarray(rough, x.dtype) * image
-    else:
-        step = np.asarray(rough, x.dtype) * direction
-    for part in blocks(len(x)):
-        step[part] = np.maximum(x[part] + step[part], 0) - x[part]
+        if not problem.nonnegative or _stays_nonnegative(x, rough, direction):
+            length = np.asarray(rough, x.dtype)
+            return length * direction, length * image
+    step, rough = np.empty_like(direction), np.asarray(rough, x.dtype)
+
+    def project(part: slice) -> None:
+        np.multiply(direction[part], rough, out=step[part])
+        step[part] += x[part]
+        np.maximum(step[part], 0, out=step[part])
+        step[part] -= x[part]
+
+    map_blocks(project, len(x))
     lowest = _minimum(problem, weigh, x, g, step)
     if lowest is None:
         return None
     # Beyond length 1 the projected step could leave the domain again.
     length = np.asarray(min(1.0, lowest[0]), x.dtype)
-    step *= length
+    if length < 1:
+        map_blocks(lambda part: np.multiply(step[part], length, out=step[part]), len(x))
     return step, length * lowest[1]
 
 
@@ -340,7 +374,7 @@ def transmission_likelihood(problem: PoissonCounts, state: SolverState | None = 
         gradient = a.T @ counts.slope(line).astype(a.dtype)
         bound = a.T @ (counts.optimum_curvature(line) * chord).astype(a.dtype)
         if prior:
-            prior.add_derivatives(x, gradient, bound)
+            bound = prior.add_derivatives(x, gradient, bound)
         x = np.maximum(x - gradient * reciprocal(bound), 0)
         state = counts.state(x, state.iteration + 1, a @ x)
         yield state

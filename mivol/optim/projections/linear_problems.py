@@ -18,7 +18,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -26,6 +26,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.kernel_recording import RecordedKernel
+from mivol.threads import map_arrays
 from mivol.tomography.projector import Projector
 from mivol.tomography.rings import PixelGains
 
@@ -142,8 +143,8 @@ def weighting(problem: LeastSquares) -> Callable[[np.ndarray], np.ndarray]:
     return lambda v: apply_weights(weights, v)
 
 
-BLOCK = 1 << 18
-"""Numbers treated at once: their temporaries stay in a cache, and the system need not clear new pages for them."""
+BLOCK, BLOCKS_AT_ONCE = 1 << 16, 16
+"""Numbers treated at once, whose temporaries stay in a cache, and successive blocks that a thread takes."""
 
 
 def blocks(n: int) -> Iterator[slice]:
@@ -151,14 +152,29 @@ def blocks(n: int) -> Iterator[slice]:
     return (slice(first, min(first + BLOCK, n)) for first in range(0, n, BLOCK))
 
 
+Result = TypeVar("Result")
+
+
+def map_blocks(work: Callable[[slice], Result], n: int) -> list[Result]:
+    """The results of ``work`` for each of the :func:`blocks` of n numbers, in their order, by as many threads as Dr.Jit has."""
+    parts = list(blocks(n))
+    chunks = [parts[first : first + BLOCKS_AT_ONCE] for first in range(0, len(parts), BLOCKS_AT_ONCE)]
+    found = map_arrays(lambda chunk: [work(part) for part in chunk], chunks, dr.thread_count())
+    return list(itertools.chain.from_iterable(found))
+
+
 def dot(a: np.ndarray, b: np.ndarray) -> float:
     """Sum in float64 in a fixed order, which BLAS does not guarantee."""
-    return sum((float(np.sum(a[part] * b[part], dtype=np.float64)) for part in blocks(len(a))), 0.0)
+    return sum(map_blocks(lambda part: float(np.sum(a[part] * b[part], dtype=np.float64)), len(a)), 0.0)
 
 
-def reciprocal(v: np.ndarray, largest: float | None = None) -> np.ndarray:
-    """1 / v; 0 for v below 1e-6 of the largest value: such rays and voxels are only grazed, and stay unchanged."""
-    floor = 1e-6 * (float(np.max(v, initial=0.0)) if largest is None else largest)
+GRAZED = 1e-6
+"""Sum of a ray's or a voxel's entries, over the largest sum, up to which it is only grazed and stays unchanged."""
+
+
+def reciprocal(v: np.ndarray) -> np.ndarray:
+    """1 / v; 0 for v of grazed rays and voxels."""
+    floor = GRAZED * float(np.max(v, initial=0.0))
     return np.where(v > floor, 1.0 / np.where(v > floor, v, 1.0), 0.0).astype(v.dtype)
 
 
@@ -267,14 +283,16 @@ class SmoothedTV:
         """The penalty."""
         return self._scale * self._sum(_penalties, x)
 
-    def add_derivatives(self, x: np.ndarray, gradient: np.ndarray, diagonal: np.ndarray) -> None:
-        """Add the derivative (n,) of the penalty, and a diagonal (n,) of its majoriser, to arrays of the caller.
+    def add_derivatives(self, x: np.ndarray, gradient: np.ndarray, diagonal: np.ndarray) -> np.ndarray:
+        """Add the derivative (n,) of the penalty to ``gradient``; return a diagonal (n,) of its majoriser plus ``diagonal``.
 
         The diagonal follows from ``(p - q)^2 <= 2 p^2 + 2 q^2`` on each difference.
         """
+        total = np.empty_like(diagonal)
         for voxels, (slope, bound) in self._run(_derivatives, x):
             gradient[voxels] += slope
-            diagonal[voxels] += bound
+            np.add(diagonal[voxels], bound, out=total[voxels])
+        return total
 
     def curvature(self, x: np.ndarray, p: np.ndarray) -> float:
         """Second derivative of the majoriser at ``x`` along ``p``."""
@@ -407,7 +425,7 @@ def scale_tv_to_noise(a: Projector, y: np.ndarray, weights: np.ndarray, tv: floa
     """
     edge = float(np.prod(a.grid.voxel_size) ** (1 / 3))
     w = np.asarray(weights, np.float64)
-    sensitivity = np.asarray(a.T @ flatten(w, a.dtype), np.float64)
+    sensitivity = a.T @ flatten(w, a.dtype)
     pull = np.sqrt(CHORD * edge * np.median(sensitivity[sensitivity > 0])) if (sensitivity > 0).any() else 0.0
     chord = ray_lengths(a).astype(np.float64).reshape(w.shape)
     mean = abs(float(np.sum(w * y * chord))) / max(float(np.sum(w * chord**2)), np.finfo(float).tiny)
