@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.ndimage import maximum_filter, median_filter, minimum_filter, uniform_filter1d
 from scipy.sparse import diags_array, eye_array
 from scipy.sparse.linalg import splu, spsolve
 from scipy.special import stdtrit
@@ -110,8 +110,8 @@ def _subtract_gains(y: np.ndarray, width: int) -> np.ndarray:
     offsets, arcs = _find_offsets(y, width), min(ARCS, len(y) // VIEWS_OF_ARC)
     if arcs >= FEWEST_ARCS:
         parts = np.array_split(y, arcs)
-        offsets_of_arcs, narrow = (np.stack([_find_offsets(part, w) for part in parts]) for w in (width, min(width, FIRST_WIDTH)))
-        offsets *= _share_of_gains(offsets_of_arcs, _exceeds_chance(narrow))
+        narrow = np.stack([_find_offsets(part, min(width, FIRST_WIDTH)) for part in parts])
+        offsets *= _share_of_gains(np.stack([_find_offsets(part, width) for part in parts]), _exceeds_chance(narrow))
     return y - offsets
 
 
@@ -218,7 +218,8 @@ def find_zingers(transmission: Transmission, threshold: float) -> np.ndarray:
     A pixel is compared with the median of the 3 x 3 pixels around it, and with the median of the same pixel in the views
     before and after: it must differ from both medians by ``threshold`` deviations, the same way. The deviation of a
     difference is that of the noise, and at least the robust deviation of all differences in the view, or of the pixel's bends
-    over time: details of the object pass by.
+    over time: details of the object pass by. They are near the pixel in the views before and after: a zinger also lies outside
+    of the range of the 3 x 5 pixels around it in one of these views.
 
     Args:
         transmission: (views, rows, cols) with its variance.
@@ -236,9 +237,22 @@ def find_zingers(transmission: Transmission, threshold: float) -> np.ndarray:
     far = around / np.maximum(np.maximum(noise, scale), 1e-12)
     bends = 1.4826 * np.median(np.abs(np.diff(filled, 2, axis=0)), axis=0) / 2 if len(value) >= 3 else 0.0
     near = before / np.maximum(np.maximum(noise, bends), 1e-12)
-    jumps = (np.abs(far) > threshold) & (np.abs(near) > threshold) & (far * near > 0)
     hot = np.mean(np.abs(far) > threshold, axis=0) > HOT_SHARE
-    return seen & (jumps | hot)
+    jumps = (np.abs(far) > threshold) & (np.abs(near) > threshold) & (far * near > 0)
+    return seen & (hot | jumps & ~_passes_by(filled - np.where(hot, around, 0.0)))
+
+
+def _passes_by(value: np.ndarray) -> np.ndarray:
+    """Whether pixels (views, rows, cols) lie in the range of the pixels around them, in both neighbouring views."""
+    size, is_inside = (1, *NEAR), np.ones(value.shape, bool)
+    highest, lowest = maximum_filter(value, size, mode="nearest"), minimum_filter(value, size, mode="nearest")
+    for here, other in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
+        is_inside[here] &= (value[here] <= highest[other]) & (value[here] >= lowest[other])
+    return is_inside & (len(value) > 1)
+
+
+NEAR = (3, 5)
+"""Rows and columns in which a detail is looked for in the views before and after: it moves along the rows, mostly."""
 
 
 HOT_SHARE = 0.75

@@ -175,6 +175,10 @@ def test_zingers_and_hot_pixels_are_found() -> None:
     wanted[3, 2, 7] = wanted[20, 4, 24:26] = wanted[9, 4, 20] = True
     wanted[:, 1, 12] = True
     np.testing.assert_array_equal(found, wanted)
+    # A detail that moves on by two columns a view is near in the views before and after.
+    passing = np.full((9, 5, 40), 0.5)
+    passing[np.arange(9), 2, 8 + 2 * np.arange(9)] = 0.8
+    assert not find_zingers(Transmission(passing, np.full(passing.shape, 1e-4)), 8.0).any()
     # A step that stays is an edge, and a row alone has neighbours too.
     edge = np.where(np.arange(30) < 11, 0.2, 0.9) * np.ones((5, 1, 1))
     assert not find_zingers(Transmission(edge, np.full(edge.shape, 1e-4)), 8.0).any()
