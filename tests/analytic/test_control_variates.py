@@ -16,6 +16,7 @@ from scipy.interpolate import RegularGridInterpolator
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import build_estimators, make_plan
 from mivol.scene.survey import survey_scene
+from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.single_scattering import control_variates
 from mivol.transport.estimators.single_scattering.control_variates import (
     CameraOrigins,
@@ -26,6 +27,7 @@ from mivol.transport.estimators.single_scattering.control_variates import (
     build_grid_control,
     count_nodes,
 )
+from mivol.transport.estimators.single_scattering.single_scattering import SingleScattering
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import Settings
@@ -34,17 +36,34 @@ from scenes import as_float32, box_of, camera, grid_volume, media_of, medium
 ALBEDO = 0.7
 
 
-def control_of(emitter: dict) -> GridControl:
-    """S in smoke too thin to attenuate light: 4 x 3 x 5 voxels, with the nodes of the coarse lattice in the corners."""
+def direct_light(emitter: dict) -> DirectLighting:
+    """In smoke too thin to attenuate light: 4 x 3 x 5 voxels, with the nodes of the coarse lattice in the corners."""
     values = np.full((4, 3, 5, 1), 1e-7, np.float32)
     scene = close_up({"smoke": smoke(values, ALBEDO)[0], "emitter": emitter})
     survey, settings = survey_scene(scene), Settings(max_depth=2)
+    needs = find_needs(scene, scene.sensors()[0], survey)
+    plan = make_plan(needs, settings)
+    return build_estimators(scene, needs, plan, settings, survey, for_images=False).direct
+
+
+def control_of(emitter: dict) -> GridControl:
+    """S in the smoke of :func:`direct_light`."""
     with dr.suspend_grad():
-        needs = find_needs(scene, scene.sensors()[0], survey)
-        plan = make_plan(needs, settings)
-        direct = build_estimators(scene, needs, plan, settings, survey, for_images=False).direct
+        direct = direct_light(emitter)
         origins = CameraOrigins(mi.Point3f(0, 0, 5), mi.Float(0), mi.Vector3f(0, 0, -1))
         return build_grid_control(direct, direct.media.bodies[0], origins)
+
+
+def test_the_control_of_the_first_rays_is_kept():
+    estimator, first, second = (
+        SingleScattering(direct_light(point((0, 0, 9))[0])),
+        *(mi.Ray3f([0, 0, z], [0, 0, -1]) for z in (5, 6)),
+    )
+    estimator.prepare_derivatives(first)
+    kept = estimator.grid_control
+    assert isinstance(kept, GridControl) and estimator.constant_control is None
+    estimator.prepare_derivatives(second)
+    assert estimator.grid_control is kept
 
 
 def test_constant_sky_of_a_colour():

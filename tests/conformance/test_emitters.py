@@ -196,6 +196,11 @@ def test_the_light_of_a_box_is_its_solid_angle(p: tuple) -> None:
     density = np.array(found.pdf_direction(it, draw.direct, on))
     np.testing.assert_allclose(np.array(draw.density)[lit], density[lit], rtol=1e-4)
     np.testing.assert_allclose(light[lit], 2.0 / np.array(draw.direct.pdf)[lit], rtol=1e-5)
+    # Chosen among others, the lamp has the probability times the density, and its light over the probability.
+    chosen = found.draw_direction(it, mi.EmitterPtr(scene.emitters()[0]), mi.Float(0.25), u, on)
+    for name, factor in (("density", 0.25), ("weight", 4)):
+        np.testing.assert_allclose(np.array(getattr(chosen, name)), factor * np.array(getattr(draw, name)), rtol=1e-5)
+    np.testing.assert_allclose(np.array(chosen.direct.pdf), 0.25 * np.array(draw.direct.pdf), rtol=1e-5)
 
 
 @pytest.mark.statistical

@@ -189,6 +189,18 @@ def test_judged_views_are_kept(
     assert (tmp_path / "views").is_dir() and (tmp_path / "film").is_dir()
 
 
+@pytest.mark.parametrize(("has_gains", "has_motions"), [(True, False), (False, True)])
+def test_fitted_gains_and_motions_are_tabled(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, has_gains: bool, has_motions: bool
+) -> None:
+    fit, _, write = finished_fit(monkeypatch, tmp_path, 3, 0, frames=0)
+    gains, motions = np.array([[1.0, 1.05, 1.0], [0.5, 1.0, 1.0], [1.0, 1.0, 1.3]]), np.arange(18.0).reshape(3, 6) / 1000
+    fit.gains, fit.motions = lambda: gains if has_gains else None, lambda: motions if has_motions else None
+    write()
+    expected = [photo_fit.tabulate_gains(["0", "1", "2"], gains)] * has_gains
+    assert fit.record.tables[1:] == expected + [photo_fit.tabulate_motions(["0", "1", "2"], motions)] * has_motions
+
+
 def test_frames_are_filtered_as_the_smaller_picture_asks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A film that is four times smaller than the photographs, over the first one's background; without judged views nothing
     is judged."""
