@@ -55,14 +55,11 @@ def control_of(emitter: dict) -> GridControl:
 
 
 def test_the_control_of_the_first_rays_is_kept():
-    estimator, first, second = (
-        SingleScattering(direct_light(point((0, 0, 9))[0])),
-        *(mi.Ray3f([0, 0, z], [0, 0, -1]) for z in (5, 6)),
-    )
-    estimator.prepare_derivatives(first)
+    estimator = SingleScattering(direct_light(point((0, 0, 9))[0]))
+    estimator.prepare_derivatives(mi.Ray3f([0, 0, 5], [0, 0, -1]))
     kept = estimator.grid_control
     assert isinstance(kept, GridControl) and estimator.constant_control is None
-    estimator.prepare_derivatives(second)
+    estimator.prepare_derivatives(mi.Ray3f([0, 0, 6], [0, 0, -1]))
     assert estimator.grid_control is kept
 
 
