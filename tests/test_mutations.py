@@ -293,10 +293,11 @@ def test_samples_judge_code_of_renders_that_tests_run(index) -> None:
     assert all((ROOT / room).is_dir() for room in guards.SAMPLING)
 
 
-@pytest.mark.parametrize(("line", "expected"), [(3, True), (6, True), (21, True), (17, False)])
-def test_lines_of_an_import_are_judged_by_the_reference(index, line: int, expected: bool) -> None:
+@pytest.mark.parametrize(("line", "expected"), [(3, True), (6, True), (21, True), (8, False)])
+def test_lines_of_an_import_are_judged_by_the_reference_and_the_file_of_the_module(index, line: int, expected: bool) -> None:
     """A constant, a default value and an attribute of a class; a line of a function is not of an import."""
-    assert (guards.OF_IMPORTS[0] in index.rounds(fault_at(line), SMALL)[0]) == expected
+    found = index.rounds(fault_at(line), SMALL)[0]
+    assert [test in found for test in (guards.OF_IMPORTS[0], "tests/test_a.py::t")] == [expected, expected]
 
 
 @pytest.mark.parametrize(

@@ -76,12 +76,16 @@ class Guards:
     slow: bool = False
     seconds: float = ALL
 
-    def find_runners(self, fault: Fault) -> list[RunTest]:
+    def find_runners(self, fault: Fault, of_import: bool = False) -> list[RunTest]:
         """The tests that run the statement of a fault: tests in files called like the module first, then the shortest.
 
-        One variant of each test comes before the further variants of all tests.
+        One variant of each test comes before the further variants of all tests. A line of an import, such as a table of
+        numbers, is also read by tests that call no function of its module: all tests in files called like the module stand
+        for them.
         """
-        chosen = sorted(self.runners.get(fault, ()), key=lambda t: (not is_named_like(t.name, fault.file), t.seconds))
+        runners = set(self.runners.get(fault, ()))
+        named = {test for test in self.tests if is_named_like(test.name, fault.file)} if of_import else set()
+        chosen = sorted(runners | named, key=lambda t: (not is_named_like(t.name, fault.file), t.seconds, t.name))
         variants: Counter[str] = Counter()
         ranks = {}
         for test in chosen:
@@ -99,11 +103,11 @@ class Guards:
            files, because the recording sees no other processes;
         4. ``OF_SAMPLES`` for code of renders that a recorded test runs.
         """
-        runners = self.find_runners(fault)
+        is_import = is_of_import(source, fault.line)
+        runners = self.find_runners(fault, is_import)
         first, rest = split_by_time(runners, min(FIRST, self.seconds))
         second = split_by_time(rest, self.seconds - FIRST)[0] if self.seconds > FIRST else []
-        of_import = OF_IMPORTS if is_of_import(source, fault.line) else ()
-        one = list(dict.fromkeys([*(test.name for test in first), *of_import, *self.listed.get(fault.file, [])]))
+        one = list(dict.fromkeys([*(test.name for test in first), *OF_IMPORTS * is_import, *self.listed.get(fault.file, [])]))
         two = [test.name for test in second if test.name not in one]
         files = self.find_test_files(fault.file, is_unrun=not runners) if self.slow or not runners else []
         which = "not slow" if not self.slow else "slow" if runners else "slow or not slow"

@@ -21,6 +21,13 @@ def test_slices_go_from_tiff_to_tiff(variant_rgb: str, monkeypatch: pytest.Monke
     assert scan_size.table("slices", answer)[2].startswith("| mivol | ")
 
 
+def test_tables() -> None:
+    slices = {"mivol": {"seconds_a_slice": 0.5}, "astra-toolbox": {"seconds_a_slice": 2.0}}
+    assert scan_size.table("slices", slices)[2:] == ["| mivol | 0.500 | 1.00 |", "| astra-toolbox | 2.000 | 4.00 |"]
+    whole = scan_size.table("whole", {"slabs": 2, "seconds": 1234.56})
+    assert whole == ["| slabs | seconds |", "|---:|---:|", "| 2 | 1235 |"]
+
+
 @pytest.mark.slow
 def test_a_whole_volume_is_stopped_and_resumed(variant_rgb: str) -> None:
     """Sixteen layers fit into the memory: the first of two slabs is written before the stop, the second after it."""
