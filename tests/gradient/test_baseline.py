@@ -12,7 +12,15 @@ from false_alarms import assert_same_mean, fresh
 from scattering_gradients import along, upper_half
 from scattering_scenes import PLACE, close_up, mivol, rough_grid, sun
 
-from mivol.transport.estimators.flights.baseline import BLOCKS, DEPENDENCE, Baseline, BaselineSums, MediumBlocks
+from mivol.transport.estimators.flights.baseline import (
+    BLOCKS,
+    DEPENDENCE,
+    PARTS,
+    Baseline,
+    BaselineSums,
+    DirectLightTable,
+    MediumBlocks,
+)
 from mivol.transport.media.body import Body
 from mivol.transport.media.extinction import ConstantExtinction
 from mivol.transport.media.grid_extinction import GridExtinction
@@ -83,19 +91,66 @@ def test_blocks_are_drawn_to_the_mean_of_all(differs: bool) -> None:
     assert (np.ptp(values) > 1) == differs
 
 
-def test_a_walk_and_a_collision_read_the_same_block() -> None:
-    """Every point in a cell of a grid has the block of the cell, and the blocks divide the grid into equal parts."""
-    body = grid_body((12, 18, 6))
-    (blocks,) = MediumBlocks.of(Scene(body))
-    lower = np.stack(np.meshgrid(*(np.arange(-1, n) for n in (6, 18, 12)), indexing="ij")).reshape(3, -1)
+def find_slope(cell: np.ndarray, w: np.ndarray, L: np.ndarray, D: np.ndarray, count: int) -> float:
+    """The slope of L on D inside of cells, by weighted least squares, drawn to 0, in float64."""
+    total = np.bincount(cell, w, count)
+    own = np.where(total > 0, total, 1)
+    L, D = (x - (np.bincount(cell, w * x, count) / own)[cell] for x in (L, D))
+    slope = (w * L * D).sum() / (w * D**2).sum()
+    noise = DEPENDENCE * (w * (L - slope * D) ** 2).sum() / (len(w) - (total > 0).sum())
+    return slope * max(1 - noise / (slope**2 * (w * D**2).sum()), 0)
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_the_baseline_follows_the_direct_light(answers: bool) -> None:
+    """Collisions whose light follows the direct light of their parts, or not, in a grid beside a medium without parts, against
+    NumPy.
+    """
+    rng = np.random.default_rng(fresh(8))
+    n, count = 4000, 2 * BLOCKS**3
+    body, x = rng.integers(0, 2, n), rng.uniform(-1, 1, (3, n))
+    w, L = rng.uniform(0.5, 2, n), rng.exponential(1, n)
+    scene = Scene(grid_body((4, 7, 9)), even_body())
+    blocks = MediumBlocks.of(scene, has_parts=True)
+    assert [own.parts for own in blocks] == [PARTS, 1] and blocks[1].first == (BLOCKS * PARTS) ** 3
+    values = np.concatenate([rng.uniform(0, 3, blocks[1].first), np.zeros(blocks[1].count)])
+    ray = mi.Ray3f(mi.Point3f([mi.Float(v) for v in x]), mi.Vector3f(0, 0, 1))
+    zero, on = dr.zeros(mi.Float64, n), dr.full(mi.Bool, True, n)
+    part = np.where(body == 0, *(np.array(own.at_point(ray, zero, on)) for own in blocks))
+    cell = np.where(body == 0, *(np.array(own.block_of(own.at_point(ray, zero, on))) for own in blocks))
+    plain = [np.array(own.at_point(ray, zero, on)) for own in MediumBlocks.of(scene)]
+    assert np.array_equal(cell, np.where(body == 0, *plain))
+    L = L + (2 * values[part] + 3 * (x[2] > 0.5) if answers else 0)
+    sums = BaselineSums(scene, DirectLightTable(blocks, mi.Float(np.tile(values, 3))))
+    sums.add(ray, zero, mi.UInt32(body), mi.Spectrum(mi.Float(w)), mi.Spectrum(mi.Float(L)), on)
+    found = sums.finish()
+    slope = find_slope(cell, w, L, values[part], count)
+    rest, _, noise = shrink(cell, w, L - slope * values[part], count)
+    of_part = np.concatenate([np.array(own.block_of(own.first + dr.arange(mi.UInt32, own.count))) for own in blocks])
+    # As without a table; the slope is a ratio of differences of sums too.
+    expected = np.tile(rest[of_part] + slope * values, 3)
+    np.testing.assert_allclose(np.array(found.values), expected, rtol=1e-3)
+    np.testing.assert_allclose([np.array(row)[0] for row in found.average], (w * L).sum() / w.sum(), rtol=1e-5)
+    left = (w * (L - slope * values[part]) ** 2).sum() / (w * L**2).sum()
+    assert found.noise[0] == pytest.approx(noise * left, rel=1e-3)
+    assert (slope > 1.9) == answers and abs(slope) < 2.1
+
+
+@pytest.mark.parametrize("has_parts", [False, True])
+def test_a_walk_and_a_collision_read_the_same_block(has_parts: bool) -> None:
+    """Every point in a cell of a grid has the block of the cell, and the blocks or parts divide the grid into equal parts."""
+    body = grid_body((12, 18, 6)) if not has_parts else grid_body((72, 108, 36))
+    (blocks,) = MediumBlocks.of(Scene(body), has_parts)
+    nodes = blocks.lattice.res[::-1]
+    lower = np.stack(np.meshgrid(*(np.arange(-1, n) for n in nodes), indexing="ij")).reshape(3, -1)
     inside = np.random.default_rng(fresh(5)).uniform(0.01, 0.99, lower.shape)
-    unit = (lower + inside + 0.5) / np.array([[6], [18], [12]])
+    unit = (lower + inside + 0.5) / np.array(nodes)[:, None]
     kept = np.all((unit > 0) & (unit < 1), axis=0)
     lower, world = lower[:, kept], (2 * unit[:, kept] - 1).astype(np.float32)
     ray = mi.Ray3f(mi.Point3f([mi.Float(v) for v in world]), mi.Vector3f(0, 0, 1))
     at = np.array(blocks.at_point(ray, dr.zeros(mi.Float64, lower.shape[1]), dr.full(mi.Bool, True, lower.shape[1])))
     assert np.array_equal(at, np.array(blocks.at_node(mi.Vector3i([mi.Int32(v) for v in lower]))))
-    assert len(np.unique(at)) == BLOCKS**3
+    assert len(np.unique(at)) == (BLOCKS * (PARTS if has_parts else 1)) ** 3
 
 
 def test_a_medium_without_a_grid_has_the_block_where_a_flight_enters_its_box() -> None:
@@ -118,8 +173,8 @@ def test_any_baseline_keeps_the_mean(density: float, monkeypatch: pytest.MonkeyP
     params[DENSITY] = density * params[DENSITY]
     params.update()
     v = upper_half(scene, DENSITY)
-    read = Baseline._read
-    noise, zero = mi.Float(np.random.default_rng(9).uniform(-2, 2, 3 * BLOCKS**3)), dr.zeros(mi.Float, 3 * BLOCKS**3)
+    read, size = Baseline._read, 3 * (BLOCKS * PARTS) ** 3
+    noise, zero = mi.Float(np.random.default_rng(9).uniform(-2, 2, size)), dr.zeros(mi.Float, size)
     monkeypatch.setattr(Baseline, "_read", lambda self, block, on: read(_of(noise, self), block, on))
     found = along(scene, DENSITY, v, integrator, 512)
     monkeypatch.setattr(Baseline, "_read", lambda self, block, on: read(_of(zero, self), block, on))
@@ -128,4 +183,4 @@ def test_any_baseline_keeps_the_mean(density: float, monkeypatch: pytest.MonkeyP
 
 
 def _of(values: mi.Float, baseline: Baseline) -> Baseline:
-    return Baseline(baseline.blocks, values, baseline.count, baseline.mean, baseline.noise)
+    return Baseline(baseline.blocks, values, baseline.count, baseline.mean, baseline.repeats, baseline.noise)

@@ -463,8 +463,9 @@ def find_mean(*args: dict, **options: object) -> np.ndarray:
 
 
 def test_small_passes_have_few_paths_for_the_baseline():
-    """Two paths a ray from 256 up to 2048, then one for 64 rays, up to 32768."""
+    """Two paths a ray from 256 up to 2048, then one for 64 rays, up to 32768; with a table 24 for the root of the rays."""
     assert [count_baseline_paths(n) for n in (16, 256, 1 << 12, 1 << 20, 1 << 22)] == [256, 512, 2048, 1 << 14, 1 << 15]
+    assert [count_baseline_paths(n, True) for n in (1 << 12, 1 << 16, 1 << 20, 1 << 22)] == [2048, 6144, 24576, 1 << 15]
 
 
 def test_baseline_in_a_white_furnace_is_the_light_of_the_sky():
