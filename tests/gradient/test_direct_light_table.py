@@ -79,9 +79,10 @@ def test_a_medium_without_a_grid_has_no_light_in_the_table() -> None:
         assert np.all(part > 0) if own.parts == PARTS else np.all(part == 0) and own.count == BLOCKS**3
 
 
-def find_baseline(monkeypatch: pytest.MonkeyPatch, **emitters: dict) -> tuple[BaselineSums, Baseline]:
+def find_baseline(monkeypatch: pytest.MonkeyPatch, g: float = 0.0, **emitters: dict) -> tuple[BaselineSums, Baseline]:
     """The baseline of a gradient of a uniform dark smoke, of a grid of cells much smaller than blocks."""
-    interior = medium("mivol_medium", grid_volume("mivol_voxels", np.full((36, 36, 36, 1), 0.5), PLACE), 0.1)
+    volume, phase = grid_volume("mivol_voxels", np.full((36, 36, 36, 1), 0.5), PLACE), {"type": "hg", "g": g}
+    interior = medium("mivol_medium", volume, 0.1, phase=phase)
     scene, found = close_up({"smoke": box_of(interior, PLACE), **emitters}, res=32), []
     finish = BaselineSums.finish
     monkeypatch.setattr(BaselineSums, "finish", lambda sums: found.append((sums, finish(sums))) or found[-1][1])
@@ -105,11 +106,10 @@ def test_baseline_of_a_large_pass_knows_the_shadows_of_a_sun(monkeypatch: pytest
     assert known.noise[0] < 0.5 * unknown.noise[0]
 
 
-@pytest.mark.parametrize("case", ["even", "small"])
-def test_no_table_without_emitter_samples_or_in_small_passes(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("case", ["even", "small", "forward"])
+def test_no_table_without_emitter_samples_in_small_passes_or_with_side_flights(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    light = {"sky": sky(1.0)} if case == "even" else {"sun": {"type": "directional", "direction": [0, 0, -1]}}
     if case == "small":
         monkeypatch.setattr(derivatives, "MIN_LISTED", 1 << 20)
-        sums, _ = find_baseline(monkeypatch, sun={"type": "directional", "direction": [0, 0, -1]})
-    else:
-        sums, _ = find_baseline(monkeypatch, sky=sky(1.0))
+    sums, _ = find_baseline(monkeypatch, g=0.8 if case == "forward" else 0.0, **light)
     assert sums.table is None
