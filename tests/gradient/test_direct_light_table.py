@@ -107,7 +107,7 @@ def test_baseline_of_a_large_pass_knows_the_shadows_of_a_sun(monkeypatch: pytest
 
 
 @pytest.mark.parametrize("case", ["even", "small", "forward"])
-def test_no_table_without_emitter_samples_in_small_passes_or_with_side_flights(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_table_in_small_passes_nor_with_side_flights(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     light = {"sky": sky(1.0)} if case == "even" else {"sun": {"type": "directional", "direction": [0, 0, -1]}}
     if case == "small":
         monkeypatch.setattr(derivatives, "MIN_LISTED", 1 << 20)

@@ -77,8 +77,9 @@ USUAL_NOISE = 0.15
 """The noise of media without a baseline."""
 
 MIN_LISTED = 1 << 15
-"""Smallest number of rays in a pass whose probes are listed, and walk in a kernel of their own, whose segments are kept, and whose
-baseline knows the direct light. In smaller passes a path walks on from its own probes, since fewer kernels matter more there."""
+"""Smallest number of rays in a pass whose probes are listed, and walk in a kernel of their own, whose segments are kept, and
+whose baseline knows the direct light. In smaller passes a path walks on from its own probes, since fewer kernels matter more
+there."""
 
 MAX_SEGMENTS = 5
 """Largest number of segments of a stem or branch that are kept in memory for the replay."""
