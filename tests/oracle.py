@@ -98,16 +98,13 @@ def overlap(*intervals: tuple[float, float]) -> tuple[float, float]:
 def corner_weights(shape: tuple[int, int, int], q: np.ndarray) -> list[tuple[tuple[np.ndarray, ...], np.ndarray]]:
     """The eight ((iz, iy, ix), weight) of points q (n, 3) in lattice coordinates; both nodes clamped to the grid."""
     low = np.floor(q).astype(np.int64)
-    f = q - low
-    corners = []
-    for dz in (0, 1):
-        for dy in (0, 1):
-            for dx in (0, 1):
-                step = np.array([dx, dy, dz])
-                node = np.clip(low + step, 0, np.array(shape) - 1)
-                weight = np.prod(np.where(step == 1, f, 1 - f), axis=1)
-                corners.append(((node[:, 2], node[:, 1], node[:, 0]), weight))
-    return corners
+    after = q - low
+    ends = [[np.clip(low[:, axis] + step, 0, shape[axis] - 1) for step in (0, 1)] for axis in range(3)]
+    shares = [(1 - after[:, axis], after[:, axis]) for axis in range(3)]
+    return [
+        ((ends[2][dz], ends[1][dy], ends[0][dx]), shares[0][dx] * shares[1][dy] * shares[2][dz])
+        for dz, dy, dx in itertools.product((0, 1), repeat=3)
+    ]
 
 
 def trilinear(values: np.ndarray, q: np.ndarray) -> np.ndarray:

@@ -121,31 +121,37 @@ class Grid:
             planes += list(np.where((t > a[:, None]) & (t < b[:, None]), t, a[:, None]).T)
         return np.sort(np.stack(planes, axis=1), axis=1)
 
-    def nodes(self, o: np.ndarray, d: np.ndarray, t_max: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Lattice points (n, K, 3) and weights (n, K): two Gauss points a cell, exact for a cubic."""
+    def nodes(self, o: np.ndarray, d: np.ndarray, t_max: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Ray (m,), lattice point (m, 3) and weight (m,): two Gauss points a cell, exact for a cubic."""
         t = np.clip(self.edges(o, d), 0, np.asarray(t_max)[:, None])
-        length = np.diff(t, axis=1)
+        # Most intervals are empty: ends of planes that the ray does not cross.
+        ray, cell = np.nonzero(t[:, 1:] > t[:, :-1])
+        start, length = t[ray, cell], t[ray, cell + 1] - t[ray, cell]
         q, dq = self._lattice(o, d)
-        at = np.concatenate([t[:, :-1] + g * length for g in GAUSS_2], axis=1)
-        return q[:, None] + at[..., None] * dq[:, None], np.concatenate([length / 2] * 2, axis=1)
+        points = np.concatenate([q[ray] + (start + g * length)[:, None] * dq[ray] for g in GAUSS_2])
+        return np.tile(ray, 2), points, np.tile(length / 2, 2)
 
     def tau(self, o: np.ndarray, d: np.ndarray, t_max: np.ndarray) -> np.ndarray:
-        q, weight = self.nodes(o, d, t_max)
-        sigma = self.read(q.reshape(-1, 3)).reshape(*weight.shape, -1)
-        return self.scale * np.einsum("nk,nkc->nc", weight, sigma)
+        ray, q, weight = self.nodes(o, d, t_max)
+        sigma = self.read(q)
+        return self.scale * np.stack([np.bincount(ray, weight * s, len(o)) for s in sigma.T], axis=1)
 
     def weigh(self, row: np.ndarray, x: np.ndarray, weight: np.ndarray) -> None:
         """Add sum_i weight_i d sigma(x_i) / d values to `row` (Z, Y, X)."""
         q, _ = self._lattice(x, np.zeros_like(x))
         inside = np.all((q >= -0.5) & (q <= np.array(grid_shape(self.values)) - 0.5), axis=1)
-        for node, corner in corner_weights(grid_shape(self.values), q):
-            np.add.at(row, node, self.scale * weight * corner * inside)
+        self._add(row, q, weight * inside)
 
     def weigh_tau(self, row: np.ndarray, o: np.ndarray, d: np.ndarray, t_max: np.ndarray, weight: np.ndarray) -> None:
         """Add sum_i weight_i d tau_i / d values to `row` (Z, Y, X)."""
-        q, length = self.nodes(o, d, t_max)
-        for node, corner in corner_weights(grid_shape(self.values), q.reshape(-1, 3)):
-            np.add.at(row, node, self.scale * (weight[:, None] * length).ravel() * corner)
+        ray, q, length = self.nodes(o, d, t_max)
+        self._add(row, q, weight[ray] * length)
+
+    def _add(self, row: np.ndarray, q: np.ndarray, weight: np.ndarray) -> None:
+        """Add weights (m,) at lattice points (m, 3): the transpose of :meth:`read`."""
+        for node, corner in corner_weights(grid_shape(self.values), q):
+            index = np.ravel_multi_index(node, row.shape)
+            row += np.bincount(index, self.scale * weight * corner, row.size).reshape(row.shape)
 
 
 class Constant:
