@@ -8,7 +8,9 @@ import re
 import shutil
 import signal
 from collections.abc import Iterator
+from html import escape
 from pathlib import Path
+from typing import IO
 
 import one_blas_thread  # noqa: F401  (before NumPy)
 import quick_kernels  # (before Dr.Jit)
@@ -21,6 +23,9 @@ import drjit
 import false_alarms
 import mitsuba as mi
 import pytest
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from PIL import Image
 
 from mivol import machine
 from mivol.scene import kept_sessions
@@ -166,6 +171,21 @@ def cpu_back_end(variant_rgb: str) -> None:
     """The test is of what a GPU does otherwise: sums in one order, tables and walks that pay on few cores only."""
     if not variant_rgb.startswith("llvm"):
         pytest.skip(f"{variant_rgb} does this otherwise: the test is of the CPU back end")
+
+
+@pytest.fixture
+def plain_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are saved as their words, or as a grey pixel: the test is of what runs find. Drawing takes longer than a small
+    run."""
+
+    def save(figure: Figure, file: IO, *, format: str, **_: object) -> None:
+        if format == "svg":
+            words = (f"<text>{escape(text.get_text())}</text>" for text in figure.findobj(Text))
+            file.write(f'<svg viewBox="0 0 1 1">{"".join(words)}</svg>')
+        else:
+            Image.new("L", (1, 1)).save(file, format)
+
+    monkeypatch.setattr(Figure, "savefig", save)
 
 
 @pytest.fixture

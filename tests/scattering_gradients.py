@@ -73,13 +73,37 @@ def upper_half(scene: mi.Scene, key: str) -> np.ndarray | float:
     return v
 
 
-def assert_transposed(there: np.ndarray, back: np.ndarray) -> None:
+def assert_transposed(there: np.ndarray, back: np.ndarray, rounding: float = 1e-4) -> None:
     """The terms of <J v, w> and of <v, J^T w> of one seed have one sum, and not 0: the same terms in another order.
 
     Of some 1000 paths of ten terms each, summed in float32; they are of both signs, so the sum of sizes counts.
     """
-    assert np.sum(there) == pytest.approx(np.sum(back), abs=1e-4 * max(np.abs(there).sum(), np.abs(back).sum()))
+    assert np.sum(there) == pytest.approx(np.sum(back), abs=rounding * max(np.abs(there).sum(), np.abs(back).sum()))
     assert np.sum(there) != 0
+
+
+def assert_each_transposed(
+    scene: mi.Scene, keys: list[str], integrator: mi.Integrator, spp: int, seed: int, rounding: float = 1e-4
+) -> None:
+    """<J v, w> = <v, J^T w> for each parameter of a scene of 8 x 8 pixels, with the same random numbers.
+
+    Each pass follows all parameters, and v is 0 for all but one: one kernel of each mode serves all of them.
+    """
+    followed = {key: watched(scene, key)[1] for key in keys}
+    rng, w = np.random.default_rng(2), np.random.default_rng(1).uniform(0.5, 1.5, (8, 8, 3))
+    along = {key: rng.uniform(0.5, 1.5, np.shape(value)) for key, value in followed.items()}
+    integrator.render_backward(scene, mi.traverse(scene), mi.TensorXf(w.astype(np.float32)), seed=seed, spp=spp)
+    back = {key: np.array(dr.grad(value), dtype=np.float64) for key, value in followed.items()}
+    params = mi.traverse(scene)
+    for chosen in keys:
+        for key in keys:
+            tangent = type(params[key])((along[key] * (key == chosen)).astype(np.float32))
+            dr.make_opaque(tangent)
+            dr.set_grad(params[key], tangent)  # a map copies what it is given
+        there = np.array(integrator.render_forward(scene, params, seed=seed, spp=spp), dtype=np.float64)
+        assert_transposed(there * w, back[chosen] * along[chosen], rounding)
+    for key, value in followed.items():
+        release(scene, key, value)
 
 
 def release(scene: mi.Scene, key: str, parameter: object) -> None:

@@ -100,6 +100,7 @@ def test_its_readme_is_five_lines_with_the_command(name):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_figures")
 @pytest.mark.parametrize("name", TINY)
 def test_scene_runs(name, tmp_path, request, script):
     changes = list(TINY[name])
@@ -279,6 +280,7 @@ def test_what_is_said_of_the_tank_in_glass(tmp_path, script):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_figures")
 def test_models_of_a_cloud(tmp_path, data_dir, script):
     """A few steps of both models from the same photographs, rendered once."""
     tiny = ("--models", "single", "all", "--size", 8, "--photo-spp", 32, "--iterations", 6)

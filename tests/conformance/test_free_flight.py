@@ -273,7 +273,7 @@ def test_media_scenes_of_mitsubas_own_tests(two_threads, name, data_dir):
     scene = mi.load_file(str(folder / f"test_{name}_volpath.xml"))
     judge = "volpathmis" if "spectral" in name else "volpath"
     found = []
-    for kind, spp in (("mivol", 8), (judge, 16)):
+    for kind, spp in (("mivol", 2), (judge, 4)):
         integrator = mi.load_dict({"type": kind, "max_depth": 6, "rr_depth": 5})
         pictures = [scenes.render(scene, integrator, spp, seed=fresh(k))[..., :3].mean(axis=(0, 1)) for k in range(16)]
         found.append(Moments.from_values(np.array(pictures, dtype=np.float64)))

@@ -152,6 +152,7 @@ def test_a_tilt_series_needs_no_toml(tmp_path: Path, capsys, suffix: str) -> Non
     assert "found 40 angles, expected 41" in " ".join("".join(capsys.readouterr()).split())
 
 
+@pytest.mark.usefixtures("plain_figures")
 def test_a_tilt_series_becomes_a_volume(variant_rgb: str, tmp_path: Path) -> None:
     write_series(tmp_path)
     (tmp_path / "series.rawtlt").write_text("\n".join(map(str, np.linspace(-60, 60, 41))))

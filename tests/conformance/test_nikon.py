@@ -106,6 +106,7 @@ def test_images_are_flipped(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_figures")
 def test_a_scan_equals_the_same_cone_beam(variant_rgb, tmp_path: Path) -> None:
     """The same readings as a stack, flipped by hand, in a cone beam with settings in TOML give the same volume.
 

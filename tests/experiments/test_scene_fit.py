@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,7 +22,7 @@ from tiny_experiment import FIT, PHOTOS, SCENE, TRUTH, assert_explained, files_o
 from mivol import config
 from mivol.config import Sought
 from mivol.config.scenes import Scene as SceneFile
-from mivol.experiments import scene_fit
+from mivol.experiments import scene_fit, start
 from mivol.experiments.scene_fit import SceneOutputs
 from mivol.experiments.start import make_start
 from mivol.files import atomic, read_exr, read_volume, write_exr
@@ -68,6 +69,9 @@ def test_optimize_leaves_a_whole_run_folder(variant_rgb, folder: Path, capsys: p
 @pytest.mark.slow
 def test_an_emissive_start_is_noted_and_not_made_again(variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The run begins from another volume than without it, says what was tried, and goes on from its checkpoint."""
+    stages = tuple(replace(stage, steps=4) for stage in start.PLAN.stages)
+    monkeypatch.setattr(start, "PLAN", replace(start.PLAN, stages=stages))
+    monkeypatch.setattr(start, "TRIAL", 2)
     plain, shaped = folder / "plain", folder / "shaped"
     few = ("--set", "fit.iterations=1")
     emissive = ("--set", 'parameter.0.start_fit="emission"')

@@ -145,6 +145,7 @@ def test_start_values_are_positive(variant_rgb, monkeypatch):
     shape[0, 0, 0] = 8.0
     monkeypatch.setattr(start, "fit_emission", lambda views, place, seed: None)
     monkeypatch.setattr(start, "average_density", lambda field, place, size: shape)
+    monkeypatch.setattr(start, "TRIAL", 1)
     problem = problem_of(np.full((2, 2, 2, 1), 0.1), np.full((2, 2, 2, 1), 0.1), 1)
     found = find_emissive_start(problem, KEY, PLACE, Adam(views=2))
     assert np.isclose(found.value.min(), found.factor * 0.1 * LEAST, rtol=1e-5)
