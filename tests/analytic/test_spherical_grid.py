@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from refusals import assert_refused
 from sampled_fields import CUBE, Cloud, Slab
+from scipy.ndimage import map_coordinates
 
 from mivol.errors import MivolError
 from mivol.fields.bricks import SparseIndex
@@ -28,6 +29,18 @@ def test_rows_of_harmonics(degree: int, basis: int, width: int) -> None:
 @pytest.mark.parametrize("basis", [-4, 0, 2, 24, 26, 36])
 def test_no_degree(basis: int) -> None:
     assert_refused("1, 4, 9, 16 or 25", harmonic_degree, basis)
+
+
+def test_between_nodes_a_field_is_trilinear(variant_rgb: str) -> None:
+    """Of random numbers: in a linear field, any two nodes of a line give the same value. Constant beyond the outer nodes."""
+    rng = np.random.default_rng(4)
+    density, sh = rng.uniform(1, 2, (3, 4, 5)), rng.uniform(0, 1, (3, 4, 5, 1, 3))
+    field = SphericalGrid.from_dense(density, sh, CUBE)
+    p = rng.uniform(-1, 1, size=(3, 60)).astype(np.float32)
+    at = (np.linalg.inv(CUBE)[:3, :3] @ p + np.linalg.inv(CUBE)[:3, 3:]) * [[5], [4], [3]] - 0.5
+    sigma, colour = field.eval(mi.Point3f(p), mi.Vector3f(0, 0, 1))
+    for found, nodes in ((sigma, density), (colour.y, field.offset + sh[..., 0, 1] * np.sqrt(0.25 / np.pi))):
+        np.testing.assert_allclose(found, map_coordinates(nodes, at[::-1], order=1, mode="nearest"), rtol=1e-5)
 
 
 def test_a_field_on_finer_nodes_is_the_same_field(variant_rgb: str) -> None:
