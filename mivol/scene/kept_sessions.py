@@ -1,8 +1,8 @@
-"""Sessions kept for the next integrator, so that a loop with a new integrator in each step replays earlier recordings.
+"""Sessions kept for the next integrator: a loop with a new integrator in each step replays earlier recordings.
 
-Conventions. An integrator takes over the session of a freed integrator with equal settings that has rendered the same scene.
-Integrators that live at the same time have sessions of their own. Mitsuba's objects take no weak references, so a kept scene is
-held, and released at the next call of this module in which nobody else holds the scene: an integrator renders or is freed.
+Conventions. An integrator takes over the session of a freed integrator with equal settings and the same scene. Integrators in
+memory at the same time have sessions of their own. Mitsuba's objects take no weak references, so the list holds each kept scene
+until nobody else does: this is checked when an integrator renders and when an integrator is freed.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import mitsuba as mi
 from mivol.scene.session import Session
 
 MAX_KEPT = 4
-"""Most pairs of a session and a scene that are kept."""
+"""Most kept pairs of a session and a scene."""
 
 @dataclass
 class _KeptSession:
-    """A session, the integrator that has it, and a scene that the session has rendered."""
+    """A session, its integrator, and a rendered scene."""
 
     session: Session
     owner: ref[mi.Integrator]
@@ -36,7 +36,7 @@ atexit.register(_kept.clear)
 
 
 def take_session(integrator: mi.Integrator, session: Session, scene: mi.Scene) -> Session:
-    """The session by which an integrator renders a scene: its own session, or a kept one if its own has rendered nothing.
+    """The session by which an integrator renders a scene: a kept session in place of an own session without renders.
 
     The integrator of the scene itself lives as long as the scene, so its session is not kept.
 
@@ -62,7 +62,7 @@ def take_session(integrator: mi.Integrator, session: Session, scene: mi.Scene) -
 
 
 def _release_scenes() -> None:
-    """Release the scenes that nobody else holds: each has one reference from each entry, and one of the call that counts."""
+    """Release the scenes held by nobody else: each has a reference from each entry, and a reference from the counting call."""
     own = Counter(id(kept.scene) for kept in _kept)
     _kept[:] = [kept for kept in _kept if sys.getrefcount(kept.scene) > own[id(kept.scene)] + 1]
 

@@ -78,7 +78,7 @@ class _SurveyedScene:
         is_joined: whether the scene and its tracer share their arrays.
         sources: the objects of whose parameters plugins compute values, by pointer; None before the first gradient.
         opened: the plans for images (True) and for derivatives (False).
-        stand_ins: of the sensors, by kind. No sensor is held: a user may load a new one in each step.
+        stand_ins: of the sensors, by kind. No sensor is held: a user may load a new sensor in each step.
         views: of the last image, for its derivatives; views kept longer would keep the derivatives of an earlier step.
         map: the bright part of the environment map.
         number: tells the recordings of scenes apart.

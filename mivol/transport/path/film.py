@@ -104,7 +104,7 @@ def film_passes(samples: RenderSamples) -> Iterator[CameraRays]:
 
 
 def sample_rays(samples: RenderSamples, own: Sequence[int]) -> list[tuple[mi.Ray3f, mi.Spectrum]]:
-    """Sample the rays and weights of all passes before a render that a recording replays, in memory.
+    """Sample the rays and weights of all passes before a recorded render, in memory.
 
     Args:
         samples: samples of the render.
@@ -201,7 +201,7 @@ def find_batch_views(sensor: mi.Sensor) -> mi.SensorPtr | None:
 
 
 def _sample_rays(samples: RenderSamples, time: mi.Float, on_film: mi.Point2f, aperture: mi.Point2f) -> tuple:
-    """Mitsuba's rays of a sensor, and their weights; or those given.
+    """Mitsuba's rays of a sensor or the given rays, and their weights.
 
     A ``batch`` keeps the index of the last view in an array that Dr.Jit does not find, and a later recording aborts the
     process. So the view of each ray is chosen here, as in Mitsuba.
