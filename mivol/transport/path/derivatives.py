@@ -94,8 +94,8 @@ derivatives are unbiased for any baseline. A pass of fewer rays than ``FEW_PATHS
 scenes: 512 paths instead of 2048 raise the variance by at most 20 %, and take .5 to .84 of the time.)"""
 
 PATHS_PER_ROOT = 24
-"""The same beside a table of direct light: at least this number times the square root of the rays. (The noise of n paths adds
-about 420 / n to the variance of a smoke beside a lamp, and n paths add 0.2 n / rays to its time, 0.8 n / rays under a sun.)"""
+"""Least number of paths with a table of direct light, over the square root of the rays. (Beside a lamp, n paths raise the
+variance by a share of 420 / n and the time by a share of 0.2 n / rays; in a dense cloud the time by 0.5 n / rays.)"""
 
 BASELINE_SEED = 0x1E7E1
 """Seed of these paths. They are independent of the paths of a render; otherwise the baseline would bias its derivatives."""
@@ -488,9 +488,9 @@ def _estimate_baseline(estimators: Estimators, ray: mi.Ray3f) -> Baseline | None
 
 
 def _tabulate_direct_light(estimators: Estimators) -> DirectLightTable | None:
-    """The direct light that collisions find by emitter samples; None if they sample no emitters.
+    """Tabulate the direct light of the emitters that collisions sample, or None if no emitter is sampled.
 
-    None with side flights too: media that scatter forwards give each direction a light of its own, and the table gains nothing.
+    None with side flights: in media that scatter forwards, light depends on the direction, and the table gains nothing.
     """
     lighting = estimators.direct
     if not estimators.lights_media_at_vertices or estimators.media.is_bounded or estimators.lobe is not None:

@@ -15,8 +15,8 @@ Large passes divide each block of a grid into ``PARTS``^3 parts with a known dir
 
 .. math:: b = c_{block} + a\,D_{part}
 
-Weighted least squares find the slope a of L over D inside of blocks, which is shrunk too. L - a D then gives c, as L gives b
-without a table.
+Weighted least squares and shrinkage give the slope a of L over D inside of blocks. Blocks of L - a D give c, as blocks of L give
+b in small passes.
 
 References: Vicini et al. 2021 (path replay); Efron & Morris 1973 (shrinkage towards the mean).
 """
@@ -45,7 +45,7 @@ BLOCKS = 6
 blocks an edge: 0.41, 0.18, 0.18, 0.19 and 0.32 beside a lamp, 0.081, 0.053, 0.055, 0.056 and 0.070 in smoke over a floor.)"""
 
 PARTS = 3
-"""Parts along an edge of a block, each with its direct light."""
+"""Parts along an edge of a block, each with one value of the direct light."""
 
 INSET = 1e-5
 """Least distance of points of parts from the faces of a grid, as a fraction of the grid [1]."""
@@ -59,11 +59,11 @@ DEPENDENCE = 3.0
 
 @dataclass
 class MediumBlocks:
-    """The blocks of a medium, divided into parts; a block without parts counts as one part.
+    """The blocks of a medium, divided into parts. An undivided block is one part.
 
     Attributes:
         body: the medium.
-        first, first_block: numbers of its first part and of its first block.
+        first, first_block: numbers of the first part and of the first block.
         lattice: grid whose cells form the parts; None for another medium.
         parts: number of parts along an edge of a block.
     """
@@ -108,7 +108,7 @@ class MediumBlocks:
         return (z * edge + y) * edge + x + self.first_block
 
     def place(self, part: mi.UInt32, inside: mi.Point3f) -> mi.Point3f:
-        """A point in the world by its part, counted from the first one, and its place ``inside`` the part in [0, 1)^3."""
+        """A point in the world, by the index of a part in this medium and the place ``inside`` the part, in [0, 1)^3."""
         u = mi.Vector3f()
         for a, (index, n) in enumerate(zip(self._indices(part), self.lattice.res[::-1], strict=True)):
             # The outermost cells are half outside of the grid.
@@ -139,7 +139,7 @@ class MediumBlocks:
         return mi.UInt32((z * self.edge + y) * self.edge + x) + self.first
 
     def _indices(self, number: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """The indices along x, y and z of a part, counted from the first one."""
+        """The indices along x, y and z, from the index of a part in this medium."""
         return number % self.edge, number // self.edge % self.edge, number // self.edge**2
 
 
@@ -282,12 +282,12 @@ class BaselineSums:
         (count, square, spread, common, inside), total = self._total(i // n, rows, events)
         slope = dr.select(spread > MIN_SPREAD * square, _ratio(common, spread), 0)
         explained = slope * common
-        # Of one collision; a slope of noise explains as much.
+        # A slope of pure noise explains as much as the noise of one collision.
         noise = DEPENDENCE * dr.maximum(inside - explained, 0) * _ratio(mi.Float(1), dr.maximum(total - count, 1))
         return slope * _ratio(dr.maximum(explained - noise, 0), explained)
 
     def _add_direct_light(self, values: mi.Float, slope: mi.Float) -> mi.Float:
-        """The values of parts, from values and slopes of each colour and block."""
+        """The values of parts, from the values and slopes of blocks."""
         j = dr.arange(mi.UInt32, self._colours * self._parts)
         part, block = j % self._parts, mi.UInt32(0)
         for own in self.blocks:

@@ -1,9 +1,9 @@
-r"""The light that emitters give to the parts of a baseline's blocks, estimated by a few emitter samples in each part.
+r"""Direct light in the parts of the blocks of a baseline, estimated by a few emitter samples in each part.
 
 .. math:: D = \frac{\alpha}{4\pi} \int L_e(\omega)\, e^{-\tau(x, \omega)}\,d\omega
 
 D is the light that a medium of albedo alpha with an isotropic phase function scatters once, averaged over points x of a part.
-The few collisions in a block cannot show the edges of shadows inside of it, and D can.
+D shows shadows inside of a block. The few collisions in a block do not.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SAMPLES = 2
 """Number of emitter samples in each part."""
 
 FIRST_PIXEL = -2
-"""Number of the row of pixels whose random numbers are drawn, outside of every film."""
+"""Row of pixels for the random numbers, outside of every film."""
 
 
 def tabulate_direct_light(
@@ -39,12 +39,12 @@ def tabulate_direct_light(
         media: media of the scene, without bounded parts.
         lighting: estimator of direct lighting.
         emitters: emitters that light collisions; None for all.
-        seed: seed of the emitter samples; not that of the render, whose derivatives the table would bias.
+        seed: seed of the emitter samples. With the seed of the render, the table would bias derivatives.
 
     Returns:
         The table; None if no block has a grid.
 
-    Bias: none as a mean over the points of a part. Cost: ``SAMPLES`` emitter samples with a shadow ray for each part.
+    Bias: none. Cost: ``SAMPLES`` emitter samples and shadow rays for each part.
     """
     blocks = MediumBlocks.of(media, has_parts=True)
     total, colours = blocks[-1].first + blocks[-1].count, dr.size_v(mi.Spectrum)
