@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy import interpolate, ndimage, stats
+from scipy import interpolate, ndimage, special
 
 from mivol.errors import MivolError
 from mivol.tomography.filtered import covers_circle, filtered_backprojection, widest_gap
@@ -288,7 +288,8 @@ def _slice_entropies(y: np.ndarray, angles: np.ndarray, columns: np.ndarray, at_
             low, high = np.percentile(values, [0.5, 99.5], axis=1)
             edges = np.linspace(1.25 * low - 0.25 * high, 1.25 * high - 0.25 * low, int(np.sqrt(disc.sum())), axis=1)
             edges[:, 0], edges[:, -1] = -np.inf, np.inf
-        entropies.append(sum(stats.entropy(np.histogram(*row)[0]) for row in zip(values, edges, strict=True)))
+        shares = [np.histogram(*row)[0] / row[0].size for row in zip(values, edges, strict=True)]
+        entropies.append(sum(float(special.entr(share).sum()) for share in shares))
     return np.array(entropies)
 
 

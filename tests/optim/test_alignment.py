@@ -191,6 +191,17 @@ def test_every_view_is_predicted_in_the_last_round(monkeypatch: pytest.MonkeyPat
     assert sigma == pytest.approx(np.hypot(scatter, SAMPLING_ERROR), rel=1e-6)
 
 
+@pytest.mark.parametrize(("held_out", "judging"), [([10, 30], [2, 7, 10, 12, 17, 22, 27, 30, 32, 37]), (range(0, 40, 5), None)])
+def test_few_held_out_views_do_not_judge_alone(monkeypatch: pytest.MonkeyPatch, held_out: list, judging: list | None) -> None:
+    """Their scatter is known too badly: with three such views, one of twenty still scans was moved."""
+    asked = []
+    monkeypatch.setattr(alignment, "_predict", lambda *given: (asked.append(given[4]), np.ones((40, 32, 32))))
+    beam, y = ParallelBeam(np.arange(40) * np.pi / 40, (32, 32)), np.ones((40, 32, 32))
+    align_views(beam, VoxelGrid((32, 32, 32)), y, y, ["shift"], np.array(held_out), rounds=3)
+    for judges in asked:
+        np.testing.assert_array_equal(judges, list(held_out) if judging is None else judging)
+
+
 def test_a_tilt_that_still_moves_is_uncertain(monkeypatch: pytest.MonkeyPatch) -> None:
     """Derivatives are twice too large, so each of three rounds takes half of the rest: the deviation is the last step."""
     wrong = 1e-3

@@ -58,6 +58,9 @@ MOST_COLUMNS = 192
 LARGEST_STEP = 2.0
 """Largest move of a view in a round [pixel]."""
 
+JUDGES = 8
+"""Fewest views that judge."""
+
 COMMON_ROUNDS, FOLD = 3, 4
 """Last rounds, in which axis and tilt move; every ``FOLD``-th view is predicted by the others."""
 
@@ -135,7 +138,7 @@ def align_views(
         y: line integrals (views, rows, cols).
         weights: inverse variances.
         refine: some of ``UNKNOWNS``. Detectors of fewer than 8 rows have moves along the columns only, and no tilt.
-        held_out: indices of views that judge; empty: every tenth, or more often for at least eight.
+        held_out: indices of views that judge; fewer than ``JUDGES``: every tenth too, or more often for at least eight.
         rounds: number of rounds.
 
     Raises:
@@ -155,7 +158,7 @@ def align_views(
     common = [0] if "axis" in refine and not own else []
     common += ([1] if own else [1, 2]) if "tilt" in refine else []
     step = min(10, max(2, len(y) // 8))
-    judges = held_out if len(held_out) else np.arange(step // 2, len(y), step)
+    judges = held_out if len(held_out) >= JUDGES else np.union1d(held_out, np.arange(step // 2, len(y), step)).astype(int)
     state, normal = _State(np.zeros((len(y), 3)), np.zeros(3)), np.empty(0)
     x, predicted, slopes = None, smooth, None
     steps: list[np.ndarray] = []
