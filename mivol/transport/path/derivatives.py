@@ -279,15 +279,17 @@ class _Branching:
         start = PathStart.at_stop(stems, sampler)
         n, several = dr.width(start.active), mi.Bool(start.active)
         followed = [body.is_followed for body in estimators.media.bodies]
+        count, single, collided = dr.opaque(mi.UInt32, 0), mi.UInt32(0), dr.empty(mi.UInt32, n)
         if any(followed) and not all(followed):
             # The light behind a collision counts in full at the collision itself, and only if the medium has derivatives.
             several &= reduce(or_, (start.flight.body == k for k, on in enumerate(followed) if on))
-        count, single, collided = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 0), dr.empty(mi.UInt32, n)
-        place = dr.scatter_inc(count, mi.UInt32(0), several)
-        if not all(followed):
-            place = dr.select(several, place, n - 1 - dr.scatter_inc(single, mi.UInt32(0), start.active & ~several))
+            single = dr.opaque(mi.UInt32, 0)
+            behind = n - 1 - dr.scatter_inc(single, mi.UInt32(0), start.active & ~several)
+            place = dr.select(several, dr.scatter_inc(count, mi.UInt32(0), several), behind)
+        else:
+            place = dr.scatter_inc(count, mi.UInt32(0), several)
         dr.scatter(collided, dr.arange(mi.UInt32, n), place, start.active)
-        dr.eval(start, collided, several, place, count, single)
+        dr.eval(start, collided, several, place, count)
         return cls(start, collided, several, place, count, single, count_branches(estimators, n, count, single))
 
     def share_of(self, number: mi.UInt32) -> mi.Float:

@@ -353,7 +353,8 @@ def join_arrays(values: list[mi.Float] | list[mi.UInt32]) -> mi.Float | mi.UInt3
 def find_even_share(scene: mi.Scene) -> mi.Float:
     """The share of constant environments in the fluence of all emitters, which are several, and all at infinity [1]."""
     emitters = scene.emitters()
-    light = tabulate_emitters(scene.emitters_dr(), mi.Point3f(0), mi.Vector3f(1), [None] * len(emitters)).everywhere
+    n, box = len(emitters), (mi.Point3f(0), mi.Vector3f(1))
+    light = tabulate_emitters(scene.emitters_dr(), *box, [None] * n, dr.full(mi.Float, 1, n)).everywhere
     even = [number for number, emitter in enumerate(emitters) if emitter.class_name() == UNIFORM_EMITTER]
     return sum((dr.gather(mi.Float, light, mi.UInt32(number)) for number in even), mi.Float(0))
 
