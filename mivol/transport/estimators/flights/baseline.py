@@ -15,8 +15,8 @@ Large passes divide each block of a grid into ``PARTS``^3 parts with a known dir
 
 .. math:: b = c_{block} + a\,D_{part}
 
-Weighted least squares and shrinkage give the slope a of L over D inside of blocks. Blocks of L - a D give c, as blocks of L give
-b in small passes.
+Weighted least squares and shrinkage give the slope a of L over D inside of blocks. Blocks of L - a D give c, as blocks of L
+give b in small passes.
 
 References: Vicini et al. 2021 (path replay); Efron & Morris 1973 (shrinkage towards the mean).
 """
