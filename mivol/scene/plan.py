@@ -269,10 +269,9 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     choices += why
     branches, why = choose_branches(needs, settings, segment)
     choices += why
-    image_branches, why = choose_image_branches(needs, settings, segment)
-    choices += why
-    near, near_in_derivatives, why = choose_near_light(needs, settings, segment)
-    choices += why
+    near, near_in_derivatives, near_reasons = choose_near_light(needs, settings, segment)
+    image_branches, why = choose_image_branches(needs, settings, segment, near)
+    choices += why + near_reasons
     lamp_rays, why = choose_lamp_rays(needs, settings)
     choices += why
     emission_rays, why = choose_emission_rays(needs, settings, segment)
@@ -473,7 +472,9 @@ def build_estimators(
         with dr.suspend_grad():
             mirrored = MirroredEmitters(scene, direct.emitters)
     ways = lobe, emission, long_paths_count, near, mirrored
-    return Estimators(direct, segment, settings, lights_surfaces, lights_media, *ways, even_share=even_share)
+    meets_light = any(kind != "delta" for kind in needs.emitter_kinds) or any(medium.emits for medium in needs.media)
+    shares = {"even_share": even_share, "meets_light": meets_light}
+    return Estimators(direct, segment, settings, lights_surfaces, lights_media, *ways, **shares)
 
 
 def _make_emission_sampling(scene: mi.Scene, media: SceneMedia, needs: Needs) -> EmissionSampling:

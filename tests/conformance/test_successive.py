@@ -184,7 +184,7 @@ def test_images_and_gradients_share_their_kernels() -> None:
     assert sorted(Counter(large).values()) == replay_and_baseline + flights_and_light
 
 
-def count_of(stem: float, branch: float, share: float, events: float, samples: int = 1 << 20) -> int:
+def count_of(stem: float, branch: float, share: float, events: float, samples: int = 1 << 20, near: bool = False) -> int:
     """Branches chosen for a measured scene."""
     facts = SimpleNamespace(
         branch_noise=BranchNoise(stem, branch, share, events),
@@ -192,7 +192,7 @@ def count_of(stem: float, branch: float, share: float, events: float, samples: i
         are_samples_independent=True,
         film_samples=samples,
     )
-    return choices.choose_image_branches(facts, Settings(max_depth=9), "free_flight")[0]
+    return choices.choose_image_branches(facts, Settings(max_depth=9), "free_flight", near)[0]
 
 
 def test_the_number_of_branches_follows_noise_and_time() -> None:
@@ -207,6 +207,18 @@ def test_the_number_of_branches_follows_noise_and_time() -> None:
     assert count_of(9.0, 1.0, 0.1, 1.0) == 1
     assert count_of(0.0, 0.0, 0.1, 1.0) == 1
     assert count_of(1.0, 9.0, 0.1, 1.0, samples=1 << 15) == 1
+
+
+def test_near_light_on_segments_makes_branches_dear() -> None:
+    """An event costs 1.2, at most 1.6 times the time of k = 1.
+
+    B = 9 A, r = 0.17: at k = 4 1.44 times the time. r = 0.85: 1.46 times at k = 2, 1.92 at 3. A = B, r = 2: k = 2 has 5 / 3 of
+    the time; r = 0.65: (1 + 0.5) / 2 of the noise in 2.3 / 1.65 of the time, a gain of 0.96.
+    """
+    assert count_of(1.0, 9.0, 0.1, 1.0, near=True) == 4
+    assert count_of(1.0, 9.0, 0.5, 1.0, near=True) == 2
+    assert count_of(1.0, 9.0, 0.5, 3.0, near=True) == 1
+    assert count_of(1.0, 1.0, 0.223, 2.0, near=True) == 1
 
 
 def test_a_preview_finds_the_noise_behind_collisions(monkeypatch: pytest.MonkeyPatch) -> None:

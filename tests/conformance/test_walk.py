@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -9,6 +10,12 @@ from false_alarms import Estimate, assert_apart, assert_precise, assert_same_mea
 from scattering_scenes import cases
 
 import scenes
+from mivol.scene.needs import find_needs
+from mivol.scene.plan import build_estimators, make_plan
+from mivol.scene.survey import survey_scene
+from mivol.transport.estimators.scores import Primal
+from mivol.transport.path.estimators import Estimators, Settings
+from mivol.transport.path.walk import advance_path, begin_path, leave_camera, walk_path
 from mivol.validate.statistics import Moments
 from scenes import ball_of, box_of, camera, grid_volume, medium, sky
 
@@ -113,3 +120,40 @@ def test_hidden_emitters():
         grey.append(Estimate(*(x[0] for x in ours)))
     shown, hidden = grey
     assert_apart(shown, hidden, expected=0.4, what="emitters shown and hidden")
+
+
+def rays_into(parts: dict, depth: int) -> tuple[Estimators, mi.Sampler, mi.Ray3f, Primal]:
+    """The estimators of a room, and 256 rays of its camera with their random numbers and a score."""
+    scene, settings, n = mi.load_dict({k: v for k, v in parts.items() if v is not None}), Settings(max_depth=depth), 256
+    survey = survey_scene(scene)
+    needs = find_needs(scene, scene.sensors()[0], survey)
+    estimators = build_estimators(scene, needs, make_plan(needs, settings), settings, survey, for_images=True)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(fresh(7), n)
+    ray, _ = scene.sensors()[0].sample_ray(mi.Float(0), mi.Float(0), sampler.next_2d(), mi.Point2f(0.5))
+    return estimators, sampler, ray, Primal(dr.zeros(mi.Spectrum, n))
+
+
+@pytest.mark.parametrize(("lights", "ends"), [({"emitter": POINT}, True), ({"sky": sky()}, False)])
+def test_paths_end_where_the_last_segment_meets_no_light(lights, ends):
+    """At depth 3 a path scatters twice. Behind the second time it finds the sky, and no lamp without a size."""
+    fog = ball_of(medium("homogeneous", 1.0, 0.9), (0, -0.2, 0), 1.0)
+    with dr.suspend_grad():
+        estimators, sampler, ray, score = rays_into(room(box=fog, ball=None, **lights), 3)
+        path = begin_path(estimators, leave_camera(estimators, sampler, ray), score)
+        for _ in range(8):
+            path = advance_path(estimators, path) if not ends or dr.any(path.active) else path
+            last = path.active & (path.depth == 2)
+            if dr.any(last):
+                break
+    assert dr.any(path.depth == 2) and dr.any(last) != ends
+
+
+def test_a_ray_through_a_mask_reaches_what_is_behind():
+    """It has not scattered, so it goes on without a light that it could meet, and the pixel is opaque."""
+    wall = {"type": "rectangle", "bsdf": RED, "to_world": turn().look_at([0, -0.2, 0], [2.0, 1.5, 3.0], [0, 1, 0]).scale(9)}
+    mask = {"type": "rectangle", "bsdf": MASK, "to_world": turn().look_at([1, 0.6, 1.5], [2.0, 1.5, 3.0], [0, 1, 0])}
+    with dr.suspend_grad():
+        estimators, sampler, ray, score = rays_into(room(ball=None, floor=wall, mask=mask, emitter=POINT), 1)
+        _, alpha = walk_path(estimators, sampler, ray, score)
+    assert np.all(np.array(alpha) == 1)

@@ -240,6 +240,7 @@ class Estimators:
             since escaping paths find its light without noise.
         lobe: mean cosine of the lobe of side flights (:mod:`.side_flight`); None without side flights.
         even_share: share of constant environments in the light of all emitters, for side flights [1].
+        meets_light: paths can meet light by chance: an emitter with a size or without a place, or an emitting medium.
         emission: sampler of the emission of media at scattering events; None to leave the emission to paths passing through.
         long_paths_count: long paths carry as much light as short ones (an even environment) or more (emitting media); roulette
             then spares them.
@@ -272,6 +273,7 @@ class Estimators:
     camera_emission: mi.Float | float = 1.0
     glass: str = "any"
     even_share: mi.Float | float = 0.0
+    meets_light: bool = True
     media: SceneMedia = field(init=False)
     draws_shadows: bool = field(init=False)
 

@@ -508,6 +508,8 @@ def _follow_segment(estimators: Estimators, path: Path) -> tuple[Path, PathEvent
 def _add_emitted_light(estimators: Estimators, path: Path, event: PathEvent) -> Path:
     """Add the emission of the surface or environment hit by the path, weighted against emitter samples."""
     scene, si = estimators.media.scene, event.si
+    if not estimators.meets_light:
+        return path
     visible = path.active & ~event.in_medium & ((path.depth > 0) | estimators.is_shown(si))
     emitter = si.emitter(scene, visible)
     if path.mirrored is not None:
@@ -611,6 +613,9 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
     survives = ~is_late | (sampler.next_1d(onward.on) < q)
     path.beta = dr.select(is_late, path.beta * dr.rcp(dr.maximum(q, 1e-30)), path.beta)
     path.active = onward.on & survives & dr.any(path.beta != 0)
+    if not estimators.meets_light:
+        # The last segment of a path would find nothing.
+        path.active &= (path.depth == 0) | (path.depth + 1 < limit)
     return path
 
 
@@ -697,13 +702,22 @@ def _add_near_light(estimators: Estimators, path: Path, segment: PathSegment, le
         places, stored = estimators.kept.places, stored & on
     if places is not None and not estimators.writes_segments:
         known = places.at(path.number.index, stored), stored
-    near = estimators.near.estimate(segment, length, samples, attached, path.active, known)
-    if places is not None and estimators.writes_segments:
-        places.set(path.number.index, near.place, stored)
-    path.score = path.score.add(near.light)
-    if path.tabulated is not None:
-        path.tabulated = path.tabulated.offer(near.tabulated, near.chance, near.shadow.active)
-    return _keep_shadow_ray(estimators, path, near.shadow, near.chance)
+
+    def add(score: Score, shadow: ShadowReservoir | None, tabulated: KeptShadow | None) -> tuple:
+        near = estimators.near.estimate(segment, length, samples, attached, path.active, known)
+        if places is not None and estimators.writes_segments:
+            places.set(path.number.index, near.place, stored)
+        score = score.add(near.light)
+        if tabulated is not None:
+            tabulated = tabulated.offer(near.tabulated, near.chance, near.shadow.active)
+        kept = _keep_shadow_ray(estimators, replace(path, score=score, shadow=shadow), near.shadow, near.chance)
+        return kept.score, kept.shadow, tabulated
+
+    # Packets of lanes pass by if none of them has such a segment.
+    state = path.score, path.shadow, path.tabulated
+    state = dr.if_stmt(args=state, cond=on, true_fn=add, false_fn=lambda *state: state, label="near light")
+    path.score, path.shadow, path.tabulated = state
+    return path
 
 
 def _add_media_emission(estimators: Estimators, path: Path, event: PathEvent, may_scatter: mi.Bool) -> Path:
