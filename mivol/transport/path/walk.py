@@ -509,6 +509,8 @@ def _add_emitted_light(estimators: Estimators, path: Path, event: PathEvent) -> 
     """Add the emission of the surface or environment hit by the path, weighted against emitter samples."""
     scene, si = estimators.media.scene, event.si
     if not estimators.meets_light:
+        # A replay of one segment waits for this term.
+        path.score = path.score.add(TrackedTerm(mi.Spectrum(0), mi.Bool(False)))
         return path
     visible = path.active & ~event.in_medium & ((path.depth > 0) | estimators.is_shown(si))
     emitter = si.emitter(scene, visible)
