@@ -2,7 +2,7 @@
 
 Conventions. An integrator takes over the session of a freed integrator with equal settings and the same scene. Integrators in
 memory at the same time have sessions of their own. Mitsuba's objects take no weak references, so the list holds each kept scene
-until nobody else does: this is checked when an integrator renders and when an integrator is freed.
+until it has the only reference: this is checked when an integrator renders and when an integrator is freed.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def take_session(integrator: mi.Integrator, session: Session, scene: mi.Scene) -
 
 
 def _release_scenes() -> None:
-    """Release the scenes held by nobody else: each has a reference from each entry, and a reference from the counting call."""
+    """Release the scenes without other owners: each has a reference from each entry, and one from the counting call."""
     own = Counter(id(kept.scene) for kept in _kept)
     _kept[:] = [kept for kept in _kept if sys.getrefcount(kept.scene) > own[id(kept.scene)] + 1]
 

@@ -61,7 +61,7 @@ class PreparedArrays:
     Attributes:
         readings: what transport reads of the values of media.
         light: table of the light of media (density, cumulative); None without a table.
-        views: sensors of a ``batch``; None for another sensor.
+        views: sensors of a ``batch``; None if the sensor is no batch.
         placements: numbers of boxes, grids and the scene (:func:`prepare_placements`); None while ``dr.freeze`` records.
         tracer: scene of the surfaces alone; None to trace the whole scene.
         emitters: weights and places of emitters (:func:`mivol.transport.estimators.lighting.emitters.read_emitters`); None

@@ -305,7 +305,7 @@ class PixelGains:
 
 
 def _smooth_striped(y: np.ndarray, width: int) -> np.ndarray:
-    """``_smooth_ranks`` of a row (views, cols) in which gains are found; another row as it is."""
+    """``_smooth_ranks`` of a row (views, cols) in which gains are found; other rows are returned unchanged."""
     is_striped = not np.array_equal(_subtract_gains(y, min(RING_WIDTHS["gain"], y.shape[1])), y)
     return _smooth_ranks(y, width) if is_striped else y
 

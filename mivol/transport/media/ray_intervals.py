@@ -230,7 +230,7 @@ def revisit_media(
         segment: the segment.
         anywhere: whether ``visit`` depends only on the length of an interval in a homogeneous medium, not on its place. With
             known ``passages``, no boundary is traced then.
-        among: the media to visit; by default all. If all of them fill boxes, no boundary is traced.
+        among: the media to visit; by default all. If they all fill boxes, no boundary is traced.
     """
     among = media.bodies if among is None else among
     traced = [body for body in media.traced if _holds(among, body)]

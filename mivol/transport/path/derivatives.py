@@ -180,7 +180,7 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
 
 
 def _count_segments(estimators: Estimators) -> tuple[int, int]:
-    """The numbers of segments of a stem and of a branch that are worth keeping; 0 if replays find all of them again."""
+    """The numbers of segments of a stem and of a branch that are worth keeping; 0 if replays find every segment again."""
     media = estimators.media
     if media.is_bounded:
         # A tracked flight leaves random numbers behind for its derivative.
@@ -258,7 +258,7 @@ class _Branching:
         has_several: stems with several branches.
         place: place of each stem with a collision in ``collided``.
         count: number of the stems with several branches (an array of one number).
-        single: number of the stems with one (an array of one number).
+        single: number of the stems with one branch (an array of one number).
         each: branches of a stem with several (an array of one number).
         stem_rooms, rooms: segments of a stem and of a branch in memory: branches behind stems. 0 without memory.
     """

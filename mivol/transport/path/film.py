@@ -36,7 +36,7 @@ class RenderSamples:
         seed: seed of the sampler; opaque, since a literal would be compiled anew in every render.
         spp: samples per pixel; 0 for the sample count of the sensor's sampler.
         pass_rays: largest number of rays in a pass.
-        views: sensors of a ``batch`` (:func:`find_batch_views`); None for another sensor.
+        views: sensors of a ``batch`` (:func:`find_batch_views`); None if the sensor is no batch.
         given: the rays and weights of the passes in their order (:func:`sample_rays`); None to sample the sensor.
     """
 
@@ -184,7 +184,7 @@ def _camera_rays(samples: RenderSamples, base: mi.Sampler, index: int, per_pass:
 
 
 def find_batch_views(sensor: mi.Sensor) -> mi.SensorPtr | None:
-    """The sensors of a ``batch`` in their order, side by side on the film; None for another sensor.
+    """The sensors of a ``batch`` in their order, side by side on the film; None if the sensor is no batch.
 
     None while ``dr.freeze`` records: arrays made then from numbers of the host are unknown to the recording.
     """

@@ -64,7 +64,7 @@ class MediumBlocks:
     Attributes:
         body: the medium.
         first, first_block: numbers of the first part and of the first block.
-        lattice: grid whose cells form the parts; None for another medium.
+        lattice: grid whose cells form the parts; None in a medium without a grid.
         parts: number of parts along an edge of a block.
     """
 
@@ -171,7 +171,7 @@ class BaselineSums:
 
     Args:
         media: media of the scene.
-        table: direct light in the parts of blocks; None for a baseline that is constant in a block.
+        table: direct light in the parts of blocks; None: the baseline is constant in a block.
 
     Attributes:
         blocks: blocks of each medium.

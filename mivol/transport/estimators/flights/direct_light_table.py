@@ -38,7 +38,7 @@ def tabulate_direct_light(
     Args:
         media: media of the scene, without bounded parts.
         lighting: estimator of direct lighting.
-        emitters: emitters that light collisions; None for all.
+        emitters: emitters that light collisions; None: all emitters.
         seed: seed of the emitter samples. With the seed of the render, the table would bias derivatives.
 
     Returns:
