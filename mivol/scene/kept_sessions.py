@@ -21,6 +21,7 @@ from mivol.scene.session import Session
 MAX_KEPT = 4
 """Most kept pairs of a session and a scene."""
 
+
 @dataclass
 class _KeptSession:
     """A session, its integrator, and a rendered scene."""
