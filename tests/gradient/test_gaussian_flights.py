@@ -64,7 +64,7 @@ def forward(scene: mi.Scene, v: dict[str, np.ndarray], spp: int, seed: int, inte
     return found
 
 
-def test_gaussians_without_a_tangent_stand_beside_a_medium_with_one() -> None:
+def test_gaussians_without_a_tangent_stand_beside_a_medium_with_one(whole_paths: None) -> None:
     """The tangent by the fog's scale is the same whether the Gaussians have no tangent or a tangent of 0, with one seed.
 
     With no tangent the Gaussians are not walked; with a tangent of 0 each adds an exact 0.
