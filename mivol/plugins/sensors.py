@@ -59,5 +59,12 @@ class CopiedCamera(mi.Sensor):
         ray.maxt = self.far * per_depth - start
         return ray, weight
 
+    def sample_ray(
+        self, time: mi.Float, wavelength: mi.Float, on_film: mi.Point2f, aperture: mi.Point2f, active: mi.Bool = True
+    ) -> tuple[mi.Ray3f, mi.Spectrum]:
+        """The same rays. A ``batch`` of another scene calls the cameras of the whole process by this name."""
+        ray, weight = self.sample_ray_differential(time, wavelength, on_film, aperture, active)
+        return mi.Ray3f(ray), weight
+
 
 mi.register_sensor("mivol_copied_camera", CopiedCamera)

@@ -1040,6 +1040,18 @@ def test_a_sensor_whose_arrays_are_hidden_is_recorded(name: str) -> None:
     assert counts[2] == counts[5] > 0 and not any(pair.recordings.failures.values())
 
 
+def test_a_batch_samples_rays_beside_a_stand_in_of_a_meter() -> None:
+    """Mitsuba's ``batch`` calls all sensors of the process in one function, stand-ins among them."""
+    meter = mi.load_dict(METERS["radiance meter"]()["meter"])
+    stand_in = StandIn(meter)
+    batch = mi.load_dict(views_of_two_kinds())
+    for sample in (batch.sample_ray, batch.sample_ray_differential):
+        ray, _ = sample(0.0, 0.5, mi.Point2f([0.25, 0.75], [0.5, 0.5]), mi.Point2f(0.5))
+        # The middle of either film looks along its camera.
+        np.testing.assert_allclose(np.array(ray.d), np.array([-1, 3, -1])[:, None] / np.sqrt(11) * [1, 1], atol=1e-6)
+    assert stand_in.takes_rays
+
+
 def test_a_turn_to_another_camera_launches_nothing_more() -> None:
     """An update of Mitsuba's camera makes 115 launches, and waits for each of 79 numbers."""
     angles = (0.0, 1.0, 2.0)
