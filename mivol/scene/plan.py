@@ -460,7 +460,7 @@ def build_estimators(
     even_share = mi.Float(0)
     if lobe is not None and not is_even and "uniform" in needs.emitter_kinds:
         with dr.suspend_grad():
-            even_share = find_even_share(scene)
+            even_share = find_even_share(scene, emitters)
     emission = _make_emission_sampling(scene, media, needs) if plan.draws_emission else None
     long_paths_count = is_even or any(medium.emits for medium in needs.media)
     near = None

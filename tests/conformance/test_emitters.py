@@ -11,7 +11,14 @@ from false_alarms import Estimate, assert_same_mean
 from scattering_scenes import assert_same_images, close_up, mivol, moments, rough_grid, smoke
 from volpath_scenes import EMITTERS, same
 
-from mivol.transport.estimators.lighting.emitters import EquiangularSampler, EventSamples, SceneEmitters, make_ball_sampler
+from mivol.transport.estimators.lighting.emitters import (
+    EquiangularSampler,
+    EventSamples,
+    SceneEmitters,
+    find_even_share,
+    make_ball_sampler,
+    read_emitters,
+)
 from mivol.transport.traversal.random_numbers import fork_state
 
 
@@ -228,3 +235,15 @@ def test_the_derivative_by_the_radiance_of_a_box(variant_rgb: str) -> None:
     image, along = np.array(means).T
     assert_same_mean(*(Estimate(v.mean(), v.var(ddof=1) / len(v), len(v)) for v in (along, image)), what="along the radiance")
     assert along.std(ddof=1) / len(along) ** 0.5 < 0.02 * along.mean()
+
+
+def test_the_even_share_follows_sampling_weights(variant_rgb: str) -> None:
+    """A sky with the share s has w s / (w s + 1 - s) with the weight w, whether the weights are read before or not."""
+    shares = []
+    for weight in (1.0, 3.0):
+        sky = {"type": "constant", "radiance": 0.2, "sampling_weight": weight}
+        scene = mi.load_dict({"type": "scene", "sky": sky, "sun": {"type": "directional", "irradiance": 2.0}})
+        shares.append([float(find_even_share(scene, numbers)[0]) for numbers in (None, read_emitters(scene))])
+    (share, read), (weighted, read_weighted) = shares
+    assert 0.1 < share < 0.9 and (share, weighted) == (read, read_weighted)
+    assert weighted == pytest.approx(3 * share / (3 * share + 1 - share), rel=1e-5)

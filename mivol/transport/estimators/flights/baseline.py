@@ -226,8 +226,8 @@ class BaselineSums:
         events = dr.gather(mi.Float, self.sums, i + 3 * colours * n, i < n)
         slope, known_rows = None, []
         if self.table is not None:
-            slope, known_rows = self._find_slope(i, W, S, Q), [S, Q]
             SD, SDD, SDL = (dr.gather(mi.Float, self.direct_sums, i + k * colours * n) for k in range(3))
+            slope, known_rows = self._find_slope(colour, (W, S, Q), (SD, SDD, SDL), events), [S, Q]
             S, Q = S - slope * SD, Q - slope * (2 * SDL - slope * SDD)
         own = _ratio(S, W)
 
@@ -267,19 +267,21 @@ class BaselineSums:
         sums = [dr.gather(mi.Float, totals, colour + k * colours) for k in range(len(rows))]
         return sums, dr.gather(mi.Float, totals, mi.UInt32(len(rows) * colours))
 
-    def _find_slope(self, i: mi.UInt32, W: mi.Float, S: mi.Float, Q: mi.Float) -> mi.Float:
+    def _find_slope(
+        self, colour: mi.UInt32, sums: tuple[mi.Float, ...], direct: tuple[mi.Float, ...], events: mi.Float
+    ) -> mi.Float:
         """The slope of the light on the direct light inside of blocks, for each colour and block.
 
         Args:
-            i: numbers of all colours and blocks.
-            W, S, Q: sums of w, w L and w L^2.
+            colour: colour of each colour and block.
+            sums: sums of w, w L and w L^2.
+            direct: sums of w D, w D^2 and w D L.
+            events: number of collisions of each block.
         """
-        n, colours = self._count, self._colours
-        SD, SDD, SDL = (dr.gather(mi.Float, self.direct_sums, i + k * colours * n) for k in range(3))
-        events = dr.gather(mi.Float, self.sums, i + 3 * colours * n, i < n)
+        (W, S, Q), (SD, SDD, SDL) = sums, direct
         filled = dr.select(W > 0, mi.Float(1), 0)
         rows = [filled, SDD, SDD - _ratio(SD * SD, W), SDL - _ratio(SD * S, W), Q - _ratio(S * S, W)]
-        (count, square, spread, common, inside), total = self._total(i // n, rows, events)
+        (count, square, spread, common, inside), total = self._total(colour, rows, events)
         slope = dr.select(spread > MIN_SPREAD * square, _ratio(common, spread), 0)
         explained = slope * common
         # A slope of pure noise explains as much as the noise of one collision.

@@ -350,11 +350,16 @@ def join_arrays(values: list[mi.Float] | list[mi.UInt32]) -> mi.Float | mi.UInt3
     return values[0]
 
 
-def find_even_share(scene: mi.Scene) -> mi.Float:
-    """The share of constant environments in the fluence of all emitters, which are several, and all at infinity [1]."""
-    emitters = scene.emitters()
-    n, box = len(emitters), (mi.Point3f(0), mi.Vector3f(1))
-    light = tabulate_emitters(scene.emitters_dr(), *box, [None] * n, dr.full(mi.Float, 1, n)).everywhere
+def find_even_share(scene: mi.Scene, numbers: mi.Float | None) -> mi.Float:
+    """The share of constant environments in the fluence of all emitters, times their sampling weights [1].
+
+    Args:
+        scene: a scene with several emitters, all at infinity.
+        numbers: of :func:`read_emitters`, which begin with the weights; None to read them here.
+    """
+    emitters, pointers, box = scene.emitters(), scene.emitters_dr(), (mi.Point3f(0), mi.Vector3f(1))
+    weights = pointers.sampling_weight() if numbers is None else numbers
+    light = tabulate_emitters(pointers, *box, [None] * len(emitters), weights).everywhere
     even = [number for number, emitter in enumerate(emitters) if emitter.class_name() == UNIFORM_EMITTER]
     return sum((dr.gather(mi.Float, light, mi.UInt32(number)) for number in even), mi.Float(0))
 
