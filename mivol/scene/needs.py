@@ -37,6 +37,7 @@ from mivol.scene.survey import (
     BranchNoise,
     MirrorNoise,
     OwnRaysNoise,
+    RefractedNoise,
     SceneSurvey,
     ShapeFacts,
     find_outside_media,
@@ -415,6 +416,7 @@ class Needs(ShapeFacts):
             measurement.
         branch_noise: what a preview measures of paths that branch (:class:`BranchNoise`); None before a measurement.
         mirror_noise: measured noise of the light mirrored by glass (:class:`MirrorNoise`); None before a measurement.
+        refracted_noise: measured noise beside lamps behind glass (:class:`RefractedNoise`); None before a measurement.
         media_light: the light that media emit; None without such light, without scattering, or if the light could not be read.
     """
 
@@ -438,6 +440,7 @@ class Needs(ShapeFacts):
     emission_noise: OwnRaysNoise | None = None
     branch_noise: BranchNoise | None = None
     mirror_noise: MirrorNoise | None = None
+    refracted_noise: RefractedNoise | None = None
     media_light: MediaLight | None = None
 
     @property
@@ -458,7 +461,8 @@ class Needs(ShapeFacts):
         may_scatter = any("sigma_t" not in key.split(".") for key, _ in differentiated)
         if any(m.emits or (may_scatter and not m.is_scattering) for m in self.media):
             return None
-        return replace(self, lamp_noise=None, branch_noise=None, mirror_noise=None, **_sort_parameters(differentiated))
+        unknown = {"lamp_noise": None, "branch_noise": None, "mirror_noise": None, "refracted_noise": None}
+        return replace(self, **unknown, **_sort_parameters(differentiated))
 
     def follow_shapes(self, boundaries: tuple[Boundary, ...], facts: ShapeFacts) -> Needs:
         """The same facts of the same shapes in other places."""

@@ -32,6 +32,7 @@ from mivol.scene.choices import (
     choose_media_light,
     choose_mirror_rays,
     choose_near_light,
+    choose_refracted_light,
     choose_scattering_points,
     choose_shadow_table,
     choose_shadows,
@@ -66,6 +67,7 @@ from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.lighting.emission_sampling import EmissionSampling, EmissionTable
 from mivol.transport.estimators.lighting.emitters import find_even_share
 from mivol.transport.estimators.lighting.kept_rays import MirroredEmitters
+from mivol.transport.estimators.lighting.refracted_light import RefractedLighting
 from mivol.transport.estimators.lighting.tabulated_shadows import TransmittanceGrid
 from mivol.transport.estimators.single_scattering.near_light import NearLighting
 from mivol.transport.estimators.single_scattering.single_scattering import PROBE_DEPTH
@@ -128,6 +130,7 @@ class Plan:
         emission_rays: own camera rays of a pixel for the light of media that does not scatter, in images; 0 for none.
         mirror_rays: own camera rays of a pixel for the light that glass mirrors to the camera, in images; 0 for none.
         keeps_mirrors: whether paths find lamps in mirrors by kept rays, in images.
+        draws_refracted_light: whether vertices draw directions to lamps through smooth glass, in images.
         lamp_rays: own camera rays a sample for the light of lamps seen directly, in images; 0 for none.
         occupied: share of occupied blocks of the first medium's grid, in steps of ``OCCUPIED_STEP`` [1]; None if unknown.
     """
@@ -156,6 +159,7 @@ class Plan:
     emission_rays: int
     mirror_rays: int
     keeps_mirrors: bool
+    draws_refracted_light: bool
 
     @property
     def decisions(self) -> tuple:
@@ -278,6 +282,8 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     choices += why
     mirror_rays, keeps_mirrors, why = choose_mirror_rays(needs, settings, segment)
     choices += why
+    draws_refracted_light, why = choose_refracted_light(needs, settings, segment)
+    choices += why
     nodes, why = choose_shadow_table(needs, settings, segment)
     choices += why
     return Plan(
@@ -305,6 +311,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         emission_rays,
         mirror_rays,
         keeps_mirrors,
+        draws_refracted_light,
     )
 
 
@@ -471,7 +478,11 @@ def build_estimators(
     if for_images and plan.keeps_mirrors:
         with dr.suspend_grad():
             mirrored = MirroredEmitters(scene, direct.emitters)
-    ways = lobe, emission, long_paths_count, near, mirrored
+    refracted = None
+    if for_images and plan.draws_refracted_light:
+        with dr.suspend_grad():
+            refracted = RefractedLighting(direct, settings.depth_limit)
+    ways = lobe, emission, long_paths_count, near, mirrored, refracted
     meets_light = any(kind != "delta" for kind in needs.emitter_kinds) or any(medium.emits for medium in needs.media)
     shares = {"even_share": even_share, "meets_light": meets_light}
     return Estimators(direct, segment, settings, lights_surfaces, lights_media, *ways, **shares)

@@ -32,6 +32,9 @@ towards the camera, and of this light along camera rays of its own.
 **Mirrors.** :func:`measure_mirror_noise` measures the same of the light mirrored by the first glass of a camera ray, and the
 variance of paths with a kept mirrored ray.
 
+**Lamps behind glass.** :func:`measure_refracted_noise` measures the variance of pixels with lamps met by chance, and with
+directions drawn through the glass.
+
 **Branches.** :func:`measure_branch_noise` measures the variance of pixels with one and with several branches of a path. With k
 branches it is A + B / k, so two numbers of branches tell the noise A of stems and B of branches.
 
@@ -58,13 +61,15 @@ from mivol.scene.choices import (
     is_lamp_noise_open,
     is_mirror_noise_open,
     is_near_light_open,
+    is_refracted_light_open,
 )
 from mivol.scene.media_light import SAMPLING_COST
 from mivol.scene.needs import Needs, find_needs
 from mivol.scene.plan import Plan, build_estimators, choose_segment, make_plan
-from mivol.scene.survey import BranchNoise, MirrorNoise, OwnRaysNoise, SceneSurvey, survey_scene
+from mivol.scene.survey import BranchNoise, MirrorNoise, OwnRaysNoise, RefractedNoise, SceneSurvey, survey_scene
 from mivol.scene_graph import traverse
 from mivol.transport.estimators.lighting.kept_rays import MirroredEmitters
+from mivol.transport.estimators.lighting.refracted_light import RefractedLighting
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.successive import walk_branching
@@ -274,7 +279,8 @@ def measure_noise(
     """
     measures = [measure_media_light, measure_near_light]
     if for_images:
-        measures = [measure_emission_noise, *measures, measure_lamp_noise, measure_branch_noise, measure_mirror_noise]
+        measures = [measure_emission_noise, *measures, measure_lamp_noise]
+        measures += [measure_refracted_noise, measure_branch_noise, measure_mirror_noise]
     for measure in measures:
         needs = measure(scene, sensor, needs, survey, settings)
     return needs
@@ -328,6 +334,29 @@ def measure_mirror_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, surve
                 kept = _measure_pixel_variance(sensor, replace(estimators, mirrored=mirrored))
             survey.mirror_noise[sensor.ptr] = MirrorNoise(own, kept)
     return replace(needs, mirror_noise=survey.mirror_noise[sensor.ptr])
+
+
+def measure_refracted_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> Needs:
+    """Measure the noise of paths beside lamps behind smooth glass: with directions through the glass, and by chance.
+
+    Arguments as for :func:`measure_media_light`; ``survey`` keeps the variances of each sensor. The light that the first glass
+    mirrors is left out: :func:`measure_mirror_noise` measures this light.
+
+    Returns:
+        The needs with the variances.
+
+    Cost: 2 x 16384 paths once, and two kernels.
+    """
+    if not _is_measurable(sensor) or not is_refracted_light_open(needs, settings, choose_segment(needs, settings)):
+        return needs
+    if sensor.ptr not in survey.refracted_noise:
+        with without_garbage_collection(), dr.suspend_grad():
+            plan = make_plan(needs, settings)
+            estimators = plan.light_of_paths(build_estimators(scene, needs, plan, settings, survey, for_images=True))
+            refracted = RefractedLighting(estimators.direct, settings.depth_limit)
+            ways = (replace(estimators, glass="transmits", refracted=way) for way in (None, refracted))
+            survey.refracted_noise[sensor.ptr] = RefractedNoise(*(_measure_pixel_variance(sensor, way) for way in ways))
+    return replace(needs, refracted_noise=survey.refracted_noise[sensor.ptr])
 
 
 DRAW_SIDE, DRAW_SAMPLES = 24, 48

@@ -82,6 +82,19 @@ class MirrorNoise:
     kept: float
 
 
+@dataclass(frozen=True)
+class RefractedNoise:
+    """Noise of paths beside lamps behind smooth glass, measured by a preview: variances in a pixel, for one sample.
+
+    Attributes:
+        by_chance: of paths that meet these lamps by chance.
+        drawn: of paths that draw a direction to a lamp at each vertex.
+    """
+
+    by_chance: float
+    drawn: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class ShapeFacts:
     """The facts about shapes and emitters.
@@ -153,6 +166,7 @@ class SceneSurvey:
         emission_noise: what previews have measured of the light of media seen directly, by sensor.
         branch_noise: what previews have measured of branching paths, by sensor.
         mirror_noise: what previews have measured of the light that glass mirrors to the camera, by sensor.
+        refracted_noise: what previews have measured of the light of lamps behind glass, by sensor.
     """
 
     boundaries: tuple[Boundary, ...]
@@ -177,6 +191,7 @@ class SceneSurvey:
     emission_noise: dict[int, OwnRaysNoise] = field(default_factory=dict)
     branch_noise: dict[int, BranchNoise] = field(default_factory=dict)
     mirror_noise: dict[int, MirrorNoise] = field(default_factory=dict)
+    refracted_noise: dict[int, RefractedNoise] = field(default_factory=dict)
 
     @property
     def may_gain(self) -> bool:

@@ -15,6 +15,7 @@ from mivol.transport.estimators.flights.free_flight import FreeFlight
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.lighting.emission_sampling import EmissionSampling
 from mivol.transport.estimators.lighting.kept_rays import KeptMirror, KeptRay, MirroredEmitters
+from mivol.transport.estimators.lighting.refracted_light import RefractedLighting
 from mivol.transport.estimators.lighting.tabulated_shadows import KeptShadow, TransmittanceGrid
 from mivol.transport.estimators.segment import Absorption, SegmentEstimator, TrackedAbsorption
 from mivol.transport.estimators.single_scattering.near_light import NearLighting
@@ -250,6 +251,7 @@ class Estimators:
         glass: what the first smooth glass of a camera ray does to it: "any" by chance, "transmits", or "mirrors"; the light of
             the last two adds up to that of the first.
         mirrored: guesses of the light in mirrors, for kept rays (:mod:`.kept_rays`); None to find lamps in mirrors by chance.
+        refracted: estimator of the light of lamps behind smooth glass, in images; None if paths meet these lamps by chance.
         kept: what walks find along their segments, in memory for replays (:mod:`.kept_segments`); None without memory.
         writes_segments: walks write to this memory; replays read it.
         shows: emitters that the camera sees directly: "all", the "lamps" (emitters with a surface), or the "rest".
@@ -267,6 +269,7 @@ class Estimators:
     long_paths_count: bool = False
     near: NearLighting | None = None
     mirrored: MirroredEmitters | None = None
+    refracted: RefractedLighting | None = None
     shows: str = "all"
     kept: KeptSegments | None = None
     writes_segments: bool = False

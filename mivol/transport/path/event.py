@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.estimators.lighting.refracted_light import TRANSMITS
 from mivol.transport.estimators.lighting.vertex import MediumVertex, MixedVertex, SurfaceVertex, Vertex
 from mivol.transport.estimators.scores import TrackedFactor
 from mivol.transport.estimators.segment import Collision, SegmentEstimate
@@ -79,9 +80,8 @@ TRANSMISSION = int(
 """Flags of BSDFs that transmit light."""
 
 
-ALMOST_ONE, MIRRORS = 1 - 2**-24, 0.0
-"""Largest float32 below 1, and the smallest. Mitsuba's glass mirrors for numbers up to the reflectance, and then its density is
-the reflectance."""
+MIRRORS = 0.0
+"""Smallest float32. Mitsuba's glass mirrors for numbers up to the reflectance, and then its density is the reflectance."""
 
 GLASS = tuple(int(mi.BSDFFlags.DeltaReflection) | int(kind) for kind in (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null))
 """Flags of the BSDFs that only mirror and transmit."""
@@ -196,7 +196,7 @@ def _sample_bsdf(
     bsdf = si.bsdf()
     component, mirrors = samples.component, estimators.glass == "mirrors"
     if samples.splits is not None:
-        component = dr.select(samples.splits, MIRRORS if mirrors else ALMOST_ONE, component)
+        component = dr.select(samples.splits, MIRRORS if mirrors else TRANSMITS, component)
     sample, weight = bsdf.sample(mi.BSDFContext(), si, component, samples.direction, event.at_surface)
     if samples.splits is not None:
         is_mirrored = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaReflection)

@@ -34,6 +34,7 @@ from mivol.transport.estimators.lighting.direct_lighting import (
 )
 from mivol.transport.estimators.lighting.emitters import is_among
 from mivol.transport.estimators.lighting.kept_rays import LARGEST_REFLECTANCE, KeptMirror
+from mivol.transport.estimators.lighting.refracted_light import RefractedSamples, VertexBeforeGlass
 from mivol.transport.estimators.lighting.tabulated_shadows import KeptShadow
 from mivol.transport.estimators.scores import IMAGE, Primal, Replay, Tangent, TrackedTerm
 from mivol.transport.estimators.segment import Collision, KnownFlight, PathSegment
@@ -123,6 +124,7 @@ class Path:
         mirrored: lanes mirrored by the last event, with the mirrored ray offered to ``mirror``; None without ``mirror``.
         met_glass: lanes that have met smooth glass; None if chance decides what glass does (``Estimators.glass``).
         number: number of the next segment among the segments in memory (:mod:`.kept_segments`); None without memory.
+        before_glass: the last vertex with a density of directions; None if lamps behind glass are met by chance.
     """
 
     ray: FineRay
@@ -149,6 +151,7 @@ class Path:
     mirror: KeptMirror | None = None
     mirrored: mi.Bool | None = None
     number: SegmentNumber | None = None
+    before_glass: VertexBeforeGlass | None = None
 
 
 @dataclass
@@ -253,6 +256,7 @@ def start_path(
         **estimators.start_kept_rays(n),
         mirrored=None if estimators.mirrored is None else dr.full(mi.Bool, False, n),
         met_glass=None if estimators.glass == "any" else dr.full(mi.Bool, False, n),
+        before_glass=None if estimators.refracted is None else VertexBeforeGlass.none(n),
     )
 
 
@@ -523,6 +527,8 @@ def _add_emitted_light(estimators: Estimators, path: Path, event: PathEvent) -> 
         pdf_emitter = _emitter_pdf(estimators, path, direct, ~path.delta & (emitter != None))
         is_balanced = estimators.direct.emitters.are_balanced(emitter)
         w_mis = dr.select(path.delta, 1, power_heuristic(path.pdf, pdf_emitter, is_balanced))
+    if path.before_glass is not None:
+        w_mis *= estimators.refracted.weigh_path(path.before_glass, emitter, visible & path.delta)
     with dr.resume_grad(when=path.score.purpose != IMAGE):
         Le = path.beta * w_mis * emitter.eval(si, visible)
     path.score = path.score.add(TrackedTerm(Le, visible))
@@ -563,6 +569,9 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
         aimed = aim_at_emitter(estimators, emitter_sample, path.beta, sampler.next_1d(arrives), flies_aside)
         path = _add_side_flight(estimators, path, event, emitter_sample, aimed, flies_aside)
 
+    if path.before_glass is not None:
+        path = _add_refracted_light(estimators, path, event, may_scatter)
+
     # -- What glass mirrors --------------------------------------------------------------------------------------------
     offered = None
     if path.mirror is not None:
@@ -601,6 +610,11 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
     if path.left_medium is not None:
         path.left_medium = dr.select(scatters, event.in_medium, path.left_medium)
     path.depth += dr.select(scatters, mi.UInt32(1), mi.UInt32(0))
+    if path.before_glass is not None:
+        is_smooth = event.in_medium | ~onward.delta
+        fresh = VertexBeforeGlass(onward.origin, mi.Vector3f(onward.ray.d), onward.pdf, mi.Bool(False), mi.Bool(False))
+        old = path.before_glass.at_specular(scatters & ~is_smooth, onward.mirrored)
+        path.before_glass = dr.select(scatters & is_smooth, fresh, old)
 
     # -- Russian roulette ----------------------------------------------------------------------------------------------
     # At surfaces q is at most 0.95, to end paths that never lose light; paths in media find their way out.
@@ -680,6 +694,20 @@ def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_
         return path
     path.score = path.score.add(TrackedTerm(value, direct.on))
     path.shadow = path.shadow.offer(light, event.chance)
+    return path
+
+
+def _add_refracted_light(estimators: Estimators, path: Path, event: PathEvent, may_scatter: mi.Bool) -> Path:
+    """Add the light of a lamp behind smooth glass, scattered at a vertex."""
+    is_smooth = event.at_surface & mi.has_flag(event.si.bsdf().flags(), mi.BSDFFlags.Smooth)
+    # The glass is another event.
+    lit = may_scatter & (event.in_medium | is_smooth) & (path.depth + 2 < estimators.settings.depth_limit)
+    sampler = path.sampler
+    samples = RefractedSamples(sampler.next_1d(lit), sampler.next_2d(lit), draw_state(sampler, lit))
+    L = estimators.refracted.estimate(event.vertex(estimators.media), samples, path.depth + 1, lit)
+    if event.collision is not None:
+        L *= dr.select(event.in_medium, event.collision.albedo, 1)
+    path.score = path.score.add(TrackedTerm(path.beta * L, lit))
     return path
 
 

@@ -162,6 +162,10 @@ class SceneEmitters:
         distribution = self._grid.at_point(p)
         return [distribution.probability(mi.UInt32(number)) for number in numbers]
 
+    def probability_at_point(self, p: mi.Point3f, number: mi.UInt32) -> mi.Float:
+        """Probability of an emitter in :meth:`choose_at_point` [1], by its number."""
+        return self._grid.at_point(p).probability(number)
+
     def ball(self, number: mi.UInt32) -> tuple[mi.Point3f, mi.Float]:
         """Centre and radius of a ``sampled`` emitter [length]; 0 for an emitter at infinity."""
         if len(self.sampled) == 1:
