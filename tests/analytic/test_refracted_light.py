@@ -179,7 +179,7 @@ def peak(g: float) -> float:
 def test_both_ways_share_the_light_by_their_densities(variant_rgb: str) -> None:
     """Along the axis out of a slab, with one lamp: light over p + q where a direction is drawn, and p / (p + q) by chance."""
     slab = {"type": "cube", "to_world": box((50, 50, 1)), "bsdf": glass()}
-    lighting = estimator({"slab": slab, "lamp": lamp(0.3, (0, 0, 5))})
+    lighting = estimator({"slab": slab, "lamp": lamp(2.5, (0, 0, 5))})
     radius = float(lighting.lamps.ball(mi.UInt32(0))[1][0])
     q = peak(1 - 0.7 * radius / 5)
     vertex = SimpleNamespace(
@@ -213,11 +213,12 @@ def test_mirrors_and_glass_are_told_apart() -> None:
         assert list(after.was_transmitted) == [not mirrors, False]
 
 
-def test_the_glass_counts_as_an_event(draws: None, variant_rgb: str) -> None:
-    """Into the ball, a scattering and out again are three events: depth 4. At depth 3 only the rim shines, by mirrors."""
-    scene = mi.load_dict({"type": "scene", **SCENES["ball"](), "sensor": camera([0, -4, 1.2], [0, 0, 0], 8, fov=10)})
+@pytest.mark.parametrize("name", ["ball", "fog behind a pane"])
+def test_the_glass_counts_as_events(draws: None, variant_rgb: str, name: str) -> None:
+    """Into the ball, a scattering and out again, or a scattering and the two faces of the pane, are three events: depth 4."""
+    scene = mi.load_dict({"type": "scene", **SCENES[name](), "sensor": camera([0, -4, 0.5], [0, 0, 0], 8, fov=10)})
     dark, lit = (np.asarray(mi.render(scene, integrator=mi.load_dict(mivol(max_depth=d)), spp=64)) for d in (3, 4))
-    assert lit.min() > 0
+    assert np.median(lit) > 0
     assert not dark.any()
 
 
