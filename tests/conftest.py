@@ -28,7 +28,6 @@ from matplotlib.text import Text
 from PIL import Image
 
 from mivol import machine
-from mivol.scene import kept_sessions
 from mivol.threads import set_thread_count
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -158,7 +157,7 @@ def each_variant(request: pytest.FixtureRequest) -> str:
 def own_sessions(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """An integrator takes over no recordings of an earlier integrator, which a test may have made with other code."""
     if "shared_sessions" not in request.fixturenames:
-        monkeypatch.setattr(kept_sessions, "take_session", lambda integrator, session, scene: session)
+        monkeypatch.setattr("mivol.scene.session.take_session", lambda integrator, session, scene: session)
 
 
 @pytest.fixture

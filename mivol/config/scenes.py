@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Literal
 
 from mivol.optim.events import EVENTS, Checkpoint, Evaluate
-from mivol.optim.first_order import Adam
+from mivol.optim.first_order import OPTIMIZERS, Adam
 from mivol.optim.losses import L2, LOSSES
 from mivol.optim.optimizer import SCHEDULES, Constant
-from mivol.optim.optimizers import OPTIMIZERS
 from mivol.optim.parameters import MAPS
 from mivol.optim.priors import PRIORS
 from mivol.optim.strategy import setting, union_type

@@ -23,11 +23,10 @@ from mivol.fields.field_files import read_field
 from mivol.fields.sampled_field import SampledField
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_exr, stack_layers
-from mivol.optim.first_order import Adam
+from mivol.optim.first_order import Adam, to_optimizer
 from mivol.optim.loop import Fit, Measure, reconstruct
 from mivol.optim.losses import L2, Loss
 from mivol.optim.optimizer import Optimizer
-from mivol.optim.optimizers import to_optimizer
 from mivol.optim.parameters import Parameter
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import View

@@ -54,8 +54,7 @@ from mivol.report.page import write_page
 from mivol.report.pixel_scale import PREVIEW, write_preview
 from mivol.report.record import Image, PlanLine, RunRecord
 from mivol.scene.explain import Explanation
-from mivol.tomography.backprojection import pixel_matrices
-from mivol.tomography.filtered import check_directions, feldkamp, filtered_backprojection
+from mivol.tomography.filtered import check_directions, feldkamp, filtered_backprojection, pixel_matrices
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid, subdivide_grid, voxel_means
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.preprocess import find_air, interpolate_gaps

@@ -1,4 +1,4 @@
-"""Gradient-based optimizers: Adam, and RMSprop without momentum.
+"""Gradient-based optimizers: Adam, RMSprop without momentum, and the optimizers of ``mi.ad``. OPTIMIZERS lists all by name.
 
 Conventions. A step changes each real number by a multiple of the learning rate. RMSprop leaves a number and the running mean
 unchanged where the derivative is 0: a batch of rays reaches few rows of a sparse field, and the other rows keep their means.
@@ -17,9 +17,10 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.kernel_recording import RecordedFunctions
-from mivol.optim.optimizer import FirstOrder, OptimizerRun
+from mivol.optim.optimizer import FirstOrder, Optimizer, OptimizerRun
 from mivol.optim.problem import DifferentiableProblem, Reals, Refinement
-from mivol.optim.strategy import setting
+from mivol.optim.second_order import GaussNewton, Lbfgs
+from mivol.optim.strategy import check_strategy, make_table, setting
 
 
 class Adam(FirstOrder, tag="adam"):
@@ -255,3 +256,71 @@ def descend(
     touched = mean > 0
     step = rate * slope * dr.rsqrt(dr.select(touched, mean, 1))
     return dr.select(touched, values - step, values), dr.select(slope == 0, squares, mean)
+
+
+OPTIMIZERS = make_table(Adam, RMSprop, Lbfgs, GaussNewton)
+"""Optimizers available in files."""
+
+
+class MitsubaOptimizer(Optimizer, tag="given", kw_only=True):
+    """An optimizer of ``mi.ad`` with separate learning rates.
+
+    Mivol cannot save the optimizer's state, and the fit has no checkpoint.
+    """
+
+    optimizer: Any
+
+    def begin(self, problem: DifferentiableProblem) -> OptimizerRun:
+        return MitsubaOptimizerRun(self, problem)
+
+
+class MitsubaOptimizerRun(OptimizerRun):
+    """State: the reals, and the state of the Mitsuba optimizer."""
+
+    def __init__(self, settings: MitsubaOptimizer, problem: DifferentiableProblem) -> None:
+        super().__init__(problem)
+        self.optimizer = settings.optimizer
+        self.optimizer.update(self.reals)
+        self.rates = {name: self.optimizer.learning_rate(name) for name in self.reals}
+
+    def step(self, iteration: int, factor: float) -> float | mi.Float:
+        loss, gradients = self.problem.loss_and_gradient(self.reals, iteration)
+        if factor != 1.0:
+            self.optimizer.set_learning_rate({name: rate * factor for name, rate in self.rates.items()})
+        for name, gradient in gradients.items():
+            dr.enable_grad(self.optimizer[name])
+            dr.set_grad(self.optimizer[name], gradient)
+        self.optimizer.step()
+        stepped = {name: dr.detach(self.optimizer[name]) for name in self.reals}
+        self.reals = self.problem.after_step(stepped, iteration)
+        for name, value in self.reals.items():
+            self.optimizer[name] = value
+        return loss
+
+    def pack(self) -> dict[str, np.ndarray]:
+        raise MivolError(
+            f"mivol cannot save the state of {type(self.optimizer).__name__} in a checkpoint: leave checkpoint out, or "
+            "choose one of mivol's optimizers."
+        )
+
+    def replace(self, name: str, reals: mi.TensorXf) -> None:
+        super().replace(name, reals)
+        self.optimizer[name] = reals
+        self.optimizer.reset(name)
+
+
+def to_optimizer(given: Optimizer | mi.ad.Optimizer) -> Optimizer:
+    """An optimizer of mivol unchanged; an optimizer of ``mi.ad`` in its adapter.
+
+    Raises:
+        MivolError: an object of another type, or as :func:`mivol.optim.strategy.check_strategy`.
+    """
+    if isinstance(given, type | Optimizer):
+        return check_strategy(given)
+    if hasattr(given, "begin"):
+        return given
+    if not isinstance(given, mi.ad.Optimizer):
+        raise MivolError(
+            f"found {type(given).__name__}, expected an optimizer of mivol or of mi.ad, or an object with begin(problem)."
+        )
+    return MitsubaOptimizer(optimizer=given)

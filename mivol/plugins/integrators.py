@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 
 from mivol.errors import MivolError
-from mivol.scene import kept_sessions
+from mivol.scene import session
 from mivol.scene.session import Session
 from mivol.transport.path.estimators import Settings
 
@@ -84,7 +84,7 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
 
     def _session_for(self, scene: mi.Scene) -> Session:
         """The session by which this integrator renders a scene."""
-        self.session = kept_sessions.take_session(self, self.session, scene)
+        self.session = session.take_session(self, self.session, scene)
         return self.session
 
     def to_string(self) -> str:

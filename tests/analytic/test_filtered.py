@@ -6,17 +6,20 @@ import numpy as np
 import pytest
 from refusals import assert_refused
 
-from mivol.tomography.backprojection import backproject_layers, backproject_voxels, have_layers, pixel_matrices
 from mivol.tomography.filtered import (
     BLEND_COLUMNS,
     WINDOWS,
     angle_steps,
+    backproject_layers,
+    backproject_voxels,
     covers_circle,
     feldkamp,
     filter_ramp,
     filtered_backprojection,
     full_turn_weights,
+    have_layers,
     parker_weights,
+    pixel_matrices,
     widest_gap,
 )
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, PencilRays, VoxelGrid

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scattering_scenes import close_up, mivol, rough_grid, smoke
 
-from mivol.scene.kept_sessions import MAX_KEPT
+from mivol.scene.session import MAX_KEPT
 from mivol.threads import set_thread_count
 from scenes import sky
 

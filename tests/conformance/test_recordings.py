@@ -36,8 +36,7 @@ from mivol.kernel_recording import (
     without_garbage_collection,
 )
 from mivol.scene import media_light, plan, readings, render_tasks, scene_state, session
-from mivol.scene.foreign_plugins import UnfollowedStateError, describe_foreign
-from mivol.scene.scene_state import SceneState, find_hidden_arrays
+from mivol.scene.scene_state import SceneState, UnfollowedStateError, describe_foreign, find_hidden_arrays
 from mivol.scene.stand_in import FORMATS, StandIn, describe_kind
 from mivol.threads import set_thread_count
 from mivol.transport.path.film import RenderSamples, film_passes, find_batch_views

@@ -17,12 +17,11 @@ from refusals import assert_refused
 from mivol.errors import MivolError
 from mivol.optim import loop
 from mivol.optim.events import Evaluate, Upsample
-from mivol.optim.first_order import Adam, RMSprop
+from mivol.optim.first_order import OPTIMIZERS, Adam, RMSprop
 from mivol.optim.interrupt import Interrupted, InterruptGuard
 from mivol.optim.loop import Course, reconstruct
 from mivol.optim.losses import Huber, Log
 from mivol.optim.optimizer import Cosine, OptimizerRun
-from mivol.optim.optimizers import OPTIMIZERS
 from mivol.optim.parameters import Parameter
 from mivol.optim.priors import Laplacian, TotalVariation
 from mivol.optim.scenes import scene_problem
