@@ -537,7 +537,8 @@ def is_mirror_noise_open(needs: Needs, settings: Settings, segment: str) -> bool
 
 def is_refracted_light_open(needs: Needs, settings: Settings, segment: str) -> bool:
     """Whether a preview decides if vertices draw the light of lamps behind smooth glass, in images."""
-    if segment != "free_flight" or settings.scatterings < 2 or not (needs.has_glass and needs.has_lamps):
+    shines = needs.has_lamps or "EnvironmentMapEmitter" in needs.emitters
+    if segment != "free_flight" or settings.scatterings < 2 or not (needs.has_glass and shines):
         return False
     return needs.are_samples_independent and needs.is_colour_film and needs.film_samples >= MIN_LAMP_SAMPLES
 

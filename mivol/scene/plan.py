@@ -481,7 +481,7 @@ def build_estimators(
     refracted = None
     if for_images and plan.draws_refracted_light:
         with dr.suspend_grad():
-            refracted = RefractedLighting(direct, settings.depth_limit)
+            refracted = RefractedLighting.of_lamps(direct, settings.depth_limit)
     ways = lobe, emission, long_paths_count, near, mirrored, refracted
     meets_light = any(kind != "delta" for kind in needs.emitter_kinds) or any(medium.emits for medium in needs.media)
     shares = {"even_share": even_share, "meets_light": meets_light}

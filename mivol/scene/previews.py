@@ -68,8 +68,8 @@ from mivol.scene.needs import Needs, find_needs
 from mivol.scene.plan import Plan, build_estimators, choose_segment, make_plan
 from mivol.scene.survey import BranchNoise, MirrorNoise, OwnRaysNoise, RefractedNoise, SceneSurvey, survey_scene
 from mivol.scene_graph import traverse
+from mivol.transport.estimators.lighting.bright_map import MapReading
 from mivol.transport.estimators.lighting.kept_rays import MirroredEmitters
-from mivol.transport.estimators.lighting.refracted_light import RefractedLighting
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.successive import walk_branching
@@ -180,7 +180,7 @@ def _render_depth_preview(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurve
     cells = DEPTH_SIDE * DEPTH_SIDE
     needs = find_needs(scene, sensor, survey, cells * DEPTH_BATCHES * DEPTH_SAMPLES, settings.may_draw_emission)
     plan = make_plan(needs, settings)
-    estimators = build_estimators(scene, needs, plan, settings, survey, for_images=True)
+    estimators = _build_for_images(scene, needs, plan, settings, survey)
     n = DEPTH_BATCHES * cells * DEPTH_SAMPLES
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(DEPTH_SEED, n)
@@ -237,7 +237,7 @@ def warn_of_last_order(
         return
     survey.warned.add("last order")
     with without_garbage_collection(), dr.suspend_grad():
-        estimators = build_estimators(scene, needs, plan, settings, survey, for_images=True)
+        estimators = _build_for_images(scene, needs, plan, settings, survey)
         if has_one_segment(estimators):
             return
         whole, shorter = (
@@ -300,7 +300,7 @@ def measure_emission_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, sur
         return needs
     if sensor.ptr not in survey.emission_noise:
         with without_garbage_collection(), dr.suspend_grad():
-            estimators = build_estimators(scene, needs, make_plan(needs, settings), settings, survey, for_images=True)
+            estimators = _build_for_images(scene, needs, make_plan(needs, settings), settings, survey)
             # The weight is an argument of one kernel.
             paths, rest = (
                 _measure_pixel_variance(sensor, replace(estimators, camera_emission=dr.opaque(mi.Float, weight)))
@@ -326,7 +326,7 @@ def measure_mirror_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, surve
     if sensor.ptr not in survey.mirror_noise:
         with without_garbage_collection(), dr.suspend_grad():
             plan = make_plan(needs, settings)
-            estimators = plan.light_of_paths(build_estimators(scene, needs, plan, settings, survey, for_images=True))
+            estimators = plan.light_of_paths(_build_for_images(scene, needs, plan, settings, survey))
             ways = estimators, replace(estimators, glass="transmits"), estimators.of_mirrors()
             own, kept = OwnRaysNoise(*(_measure_pixel_variance(sensor, way) for way in ways)), math.inf
             if not any(m.bounded or m.has_own_walk for m in needs.media):
@@ -352,9 +352,9 @@ def measure_refracted_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, su
     if sensor.ptr not in survey.refracted_noise:
         with without_garbage_collection(), dr.suspend_grad():
             plan = make_plan(needs, settings)
-            estimators = plan.light_of_paths(build_estimators(scene, needs, plan, settings, survey, for_images=True))
-            refracted = RefractedLighting(estimators.direct, settings.depth_limit)
-            ways = (replace(estimators, glass="transmits", refracted=way) for way in (None, refracted))
+            made = _build_for_images(scene, needs, replace(plan, draws_refracted_light=True), settings, survey)
+            drawn = replace(plan.light_of_paths(made), glass="transmits")
+            ways = replace(drawn, refracted=None), drawn
             survey.refracted_noise[sensor.ptr] = RefractedNoise(*(_measure_pixel_variance(sensor, way) for way in ways))
     return replace(needs, refracted_noise=survey.refracted_noise[sensor.ptr])
 
@@ -431,7 +431,7 @@ def measure_lamp_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey:
     if sensor.ptr not in survey.lamp_noise:
         with without_garbage_collection(), dr.suspend_grad():
             plan = make_plan(needs, settings)
-            estimators = plan.light_of_paths(build_estimators(scene, needs, plan, settings, survey, for_images=True))
+            estimators = plan.light_of_paths(_build_for_images(scene, needs, plan, settings, survey))
             edge = _measure_pixel_variance(sensor, estimators.of_lamps())
             rest = _measure_pixel_variance(sensor, replace(estimators, shows="rest")) if edge > 0 else 0.0
         survey.lamp_noise[sensor.ptr] = (edge, rest)
@@ -457,9 +457,15 @@ def measure_branch_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, surve
     if sensor.ptr not in survey.branch_noise:
         with without_garbage_collection(), dr.suspend_grad():
             plan = make_plan(needs, settings)
-            estimators = build_estimators(scene, needs, plan, settings, survey, for_images=True)
+            estimators = _build_for_images(scene, needs, plan, settings, survey)
             survey.branch_noise[sensor.ptr] = _measure_branches(sensor, plan.light_of_paths(estimators))
     return replace(needs, branch_noise=survey.branch_noise[sensor.ptr])
+
+
+def _build_for_images(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, survey: SceneSurvey) -> Estimators:
+    """The estimators of an image; the environment map is read only where its focus behind glass is drawn."""
+    bright = MapReading().follow(scene).table if plan.draws_refracted_light else None
+    return build_estimators(scene, needs, plan, settings, survey, for_images=True, bright=bright)
 
 
 def _is_measurable(sensor: mi.Sensor) -> bool:
@@ -517,7 +523,7 @@ def measure_emitter_noise(
     plan = make_plan(needs, settings)
 
     def variance() -> float:
-        return _measure_pixel_variance(sensor, build_estimators(scene, needs, plan, settings, survey, for_images=True))
+        return _measure_pixel_variance(sensor, _build_for_images(scene, needs, plan, settings, survey))
 
     shares = []
     with without_garbage_collection(), dr.suspend_grad():
@@ -585,7 +591,7 @@ def sampling_gain(met: NDArray, drawn: NDArray) -> float:
 def _render_draw_preview(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurvey, settings: Settings) -> NDArray:
     """Mean radiance over all colours of each sample (cells, DRAW_SAMPLES), along the middle of each cell."""
     plan = make_plan(needs, settings)
-    estimators = plan.light_of_paths(build_estimators(scene, needs, plan, settings, survey, for_images=True))
+    estimators = plan.light_of_paths(_build_for_images(scene, needs, plan, settings, survey))
     return _walk_cells(sensor, estimators, DRAW_SIDE, DRAW_SAMPLES)
 
 

@@ -46,6 +46,7 @@ class BrightMap:
         sums: density of blocks of cells (:func:`_sum_blocks`).
         to_world: rotation from the map to the world (3 x 3), row by row.
         ball: centre and radius of a ball around the scene [length].
+        focus: direction and angular radius [rad] of the part that causes the noise of chance (:func:`_find_focus`).
     """
 
     columns: int
@@ -54,6 +55,7 @@ class BrightMap:
     sums: mi.Float
     to_world: mi.Float
     ball: mi.Float
+    focus: mi.Float
 
     @classmethod
     def from_radiance(cls, light: NDArray, to_world: NDArray, ball: NDArray) -> BrightMap | None:
@@ -65,7 +67,7 @@ class BrightMap:
         cells = (pairs[1:] + pairs[:-1]) / 4
         if not cells.sum() > 0:
             return None
-        numbers = excess / cells.mean(), _sum_blocks(cells / cells.sum()), to_world, ball
+        numbers = excess / cells.mean(), _sum_blocks(cells / cells.sum()), to_world, ball, _find_focus(light, to_world)
         return cls(columns, rows, *(mi.Float(copy_aligned(n.astype(np.float32).ravel())) for n in numbers))
 
     def sample(
@@ -134,6 +136,21 @@ class BrightMap:
         following = dr.select(column + 1 < self.columns, column + 1, 0)
         places = (j * self.columns + k for j in (row, row + 1) for k in (column, following))
         return [dr.gather(mi.Float, self.density, place, active) for place in places]
+
+
+def _find_focus(light: NDArray, to_world: NDArray) -> NDArray:
+    """Mean direction of a map (rows, columns) in the world, and the root mean square angle around this direction [rad].
+
+    Directions count by the square of their radiance: paths that meet the map by chance have this second moment.
+    """
+    rows, columns = light.shape
+    theta, phi = np.linspace(0, np.pi, rows)[:, None], (np.arange(columns) + 0.5) * (2 * np.pi / columns)
+    weight = np.square(light) * np.sin(theta)
+    local = np.array([np.sin(phi) * np.sin(theta), np.cos(theta) * np.ones(columns), -np.cos(phi) * np.sin(theta)])
+    mean = (local * weight).sum((1, 2)) / weight.sum()
+    length = np.linalg.norm(mean)
+    d = to_world @ (mean / max(length, 1e-9))
+    return np.array([*d, np.sqrt(max(2 - 2 * length, 0.0))])
 
 
 def _count_halvings(rows: int, columns: int) -> tuple[int, int]:

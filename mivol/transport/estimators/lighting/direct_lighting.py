@@ -191,6 +191,11 @@ class DirectLighting:
         self.media, self.shadow_table, self._numbers = media, None, emitters
         self._resamples, self._bright = resamples, bright
 
+    @property
+    def bright(self) -> BrightMap | None:
+        """The bright part of the environment map; None without a map, and in derivatives."""
+        return self._bright
+
     @cached_property
     def emitters(self) -> SceneEmitters:
         """The emitters of the scene. Their tables are made at the first call, which must not lie in a recorded loop."""

@@ -1,4 +1,5 @@
-r"""The light of lamps behind smooth glass: each vertex draws a direction in which a bent ray may meet a lamp.
+r"""The light of lamps behind smooth glass: each vertex draws a direction in which a bent ray may meet a lamp or the bright
+focus of an environment map.
 
 .. math:: L = \frac{f(\omega)\, T\, L_e}{P\, q(\omega) + p(\omega)}
 
@@ -6,6 +7,8 @@ No straight ray passes smooth glass, so emitter samples find no light behind gla
 vertex chooses a lamp with the probability P, draws a direction omega from a lobe q around the way to the lamp, and follows the
 ray through all smooth glass ahead. T contains the transmitted shares. Paths that meet the same lamp by chance, through glass
 alone, sample the same light with the density p of a BSDF or phase function. The balance heuristic weighs both.
+
+The focus of a map (:class:`.BrightMap`) counts as a lamp far away.
 
 The axis of the lobe comes from one step: the straight line to the middle of the lamp is traced to the first glass, and the line
 from there to the lamp is refracted back to the vertex. The lobe (Henyey & Greenstein) is as wide as the lamp and the step
@@ -31,6 +34,9 @@ from mivol.transport.traversal.rays import FineRay, spawn_ray
 
 __all__ = ["TRANSMITS", "RefractedLighting", "RefractedSamples", "VertexBeforeGlass"]
 
+
+FAR = 1e4
+"""Distance of the focus of a map, over the size of the scene [1]."""
 
 WIDTH = 0.7
 """Width of a lobe, 1 - g, over the angle of the lamp and of the step together [1/rad] (measured: 0.3 and 1.5 have the same
@@ -128,6 +134,15 @@ class RefractedLighting:
         self.media, self.depth_limit = direct.media, depth_limit
         # The tables are made here, outside of recorded loops.
         self.lamps = direct.near_emitters
+        self._focus, self._map = None, None
+        if direct.bright is not None:
+            self._focus, self._map = direct.bright.focus, self.media.scene.environment()
+
+    @classmethod
+    def of_lamps(cls, direct: DirectLighting, depth_limit: int) -> RefractedLighting | None:
+        """Make the estimator; None without lamps and without a map (or if the map has gradients enabled)."""
+        made = cls(direct, depth_limit)
+        return made if made.lamps.sampled or made._map is not None else None
 
     def estimate(self, vertex: Vertex, samples: RefractedSamples, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
         """Estimate the light of lamps behind smooth glass scattered at a vertex, over the albedo in media [radiance].
@@ -139,7 +154,7 @@ class RefractedLighting:
             active: lanes to estimate.
         """
         it = vertex.interaction
-        number, _ = self.lamps.choose_at_point(it.p, samples.which_lamp)
+        number = self._choose(it, samples.which_lamp)
         axis, g = self._aim(it, number, active)
         d = scattered_direction(-axis, sample_hg(samples.direction.x, g), samples.direction.y)
         f, pdf = vertex.eval_and_pdf(d, active)
@@ -157,8 +172,8 @@ class RefractedLighting:
             emitter: the emitter.
             active: lanes that have met the emitter.
         """
-        number = self.lamps.number_of(emitter)
-        on = active & before.was_transmitted & ~before.was_mirrored & (number < len(self.lamps.sampled))
+        number, known = self._number_of(emitter)
+        on = active & before.was_transmitted & ~before.was_mirrored & known
 
         def weigh(before: VertexBeforeGlass, number: mi.UInt32) -> mi.Float:
             axis, g = self._aim(before.interaction, number, on)
@@ -173,11 +188,54 @@ class RefractedLighting:
 
     def _density(self, it: mi.Interaction3f, number: mi.UInt32, axis: mi.Vector3f, g: mi.Float, d: mi.Vector3f) -> mi.Float:
         """Density of a direction in :meth:`estimate`, with the probability of the lamp [1/sr]."""
-        return self.lamps.probability_at_point(it.p, number) * eval_hg(angle_between(-axis, d), g)
+        return self._probability(it, number) * eval_hg(angle_between(-axis, d), g)
+
+    # -- Lamps by number: the focus of the map comes behind the lamps ---------------------------------------------------------
+
+    @property
+    def _map_share(self) -> float:
+        """Probability of the map [1]."""
+        return 0.0 if self._map is None else 0.5 if self.lamps.sampled else 1.0
+
+    def _choose(self, it: mi.Interaction3f, u: mi.Float) -> mi.UInt32:
+        share, count = self._map_share, len(self.lamps.sampled)
+        if share == 1:
+            return dr.full(mi.UInt32, count, dr.width(u))
+        number, _ = self.lamps.choose_at_point(it.p, dr.minimum((u - share) / (1 - share), TRANSMITS))
+        return dr.select(u < share, count, number)
+
+    def _probability(self, it: mi.Interaction3f, number: mi.UInt32) -> mi.Float:
+        share, is_map = self._map_share, number == len(self.lamps.sampled)
+        if share == 1:
+            return mi.Float(1)
+        of_lamp = self.lamps.probability_at_point(it.p, dr.select(is_map, 0, number))
+        return dr.select(is_map, share, (1 - share) * of_lamp)
+
+    def _number_of(self, emitter: mi.EmitterPtr) -> tuple[mi.UInt32, mi.Bool]:
+        """The number of an emitter, and lanes in which there is one."""
+        count, number, known = len(self.lamps.sampled), mi.UInt32(0), mi.Bool(False)
+        if count:
+            number = self.lamps.number_of(emitter)
+            known = number < count
+        if self._map is not None:
+            is_map = emitter == mi.EmitterPtr(self._map)
+            number, known = dr.select(is_map, count, number), known | is_map
+        return number, known
+
+    def _ball(self, it: mi.Interaction3f, number: mi.UInt32) -> tuple[mi.Point3f, mi.Float]:
+        """Centre and radius of a lamp, as seen from a point [length]."""
+        count, centre, radius = len(self.lamps.sampled), mi.Point3f(0), mi.Float(0)
+        if count:
+            centre, radius = self.lamps.ball(number)
+        if self._map is None:
+            return centre, radius
+        x, y, z, angle = (dr.gather(mi.Float, self._focus, mi.UInt32(k)) for k in range(4))
+        far, is_map = FAR * self.media.size, number == count
+        return dr.select(is_map, it.p + far * mi.Vector3f(x, y, z), centre), dr.select(is_map, far * angle, radius)
 
     def _aim(self, it: mi.Interaction3f, number: mi.UInt32, active: mi.Bool) -> tuple[mi.Vector3f, mi.Float]:
         """The axis and the mean cosine of the lobe at a point, for a lamp."""
-        centre, radius = self.lamps.ball(number)
+        centre, radius = self._ball(it, number)
         away = mi.Vector3f(centre - it.p)
         straight = dr.normalize(away)
         si = self.media.tracer.ray_intersect(it.spawn_ray(straight), mi.RayFlags.All, False, active)
@@ -200,13 +258,14 @@ class RefractedLighting:
         self, ray: FineRay, medium: mi.MediumPtr, number: mi.UInt32, depth: mi.UInt32, rng: mi.UInt32, active: mi.Bool
     ) -> mi.Spectrum:
         """The light of a lamp along a ray through smooth glass, dimmed by all on the way [radiance]."""
-        media, lamps, limit = self.media, self.lamps, self.depth_limit
+        media, limit = self.media, self.depth_limit
 
         def step(state: _RayThroughGlass) -> tuple[_RayThroughGlass]:
             end, _, _, T = find_transmittance(media, state.ray, state.medium, state.on, state.rng)
             si, T = end.si, state.T * T
             emitter = si.emitter(media.scene, state.on)
-            lit = state.on & state.has_crossed & (emitter != None) & (lamps.number_of(emitter) == number)
+            found, known = self._number_of(emitter)
+            lit = state.on & state.has_crossed & known & (found == number)
             L = state.L + dr.select(lit, T * emitter.eval(si, lit), 0)
             # -- Through the glass --------------------------------------------------------------------------------------
             on = state.on & si.is_valid() & dr.any(T != 0) & (state.depth + 1 < limit)
