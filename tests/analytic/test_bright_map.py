@@ -42,6 +42,31 @@ def directions(u: mi.Point2f) -> mi.Vector3f:
     return mi.warp.square_to_uniform_sphere(u)
 
 
+def test_the_focus_is_where_the_square_of_the_radiance_is() -> None:
+    """Rationale: directions count by the square of their radiance. Expected: the mean direction of two suns of the radiances 10
+    and 20, which count 1 to 4, and their root mean square angle about it, by single pixels of a fine map: 1e-3 of a radian."""
+    rows, columns = 64, 128
+    pixels = np.zeros((rows, columns, 3))
+    places = {(20, 30): 10.0, (26, 36): 20.0}
+    for place, radiance in places.items():
+        pixels[place] = radiance
+    scene = make_scene(pixels)
+    turned = np.array(scene.environment().world_transform().matrix).reshape(4, 4)[:3, :3]
+    suns, weights = [], []
+    for (row, column), radiance in places.items():
+        theta, phi = np.pi * row / (rows - 1), 2 * np.pi * (column + 0.5) / columns
+        suns.append(turned @ [np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)])
+        weights.append(radiance**2 * np.sin(theta))
+    mean = np.average(suns, axis=0, weights=weights)
+    angle = np.sqrt(2 - 2 * np.linalg.norm(mean))
+    np.testing.assert_allclose(read(scene).focus, [*(mean / np.linalg.norm(mean)), angle], atol=1e-3)
+
+
+def test_an_even_map_has_no_focus() -> None:
+    """All directions together: a mean of 0, and an angle of sqrt(2)."""
+    assert float(read(make_scene(np.ones((8, 16, 3)))).focus[3]) == pytest.approx(np.sqrt(2), abs=1e-3)
+
+
 @pytest.mark.parametrize(("rows", "columns"), [(6, 9), (9, 4)])
 def test_the_density_is_the_radiance_above_a_share_of_its_mean(rows: int, columns: int) -> None:
     """Rationale: bilinear between the nodes of the map, in proportion to the excess times the sine. Expected: a twin in

@@ -15,6 +15,7 @@ from mivol.experiments.script import explain
 from mivol.scene import choices, plan
 from mivol.scene.needs import find_needs
 from mivol.scene.survey import RefractedNoise, survey_scene
+from mivol.transport.estimators.lighting.bright_map import MapReading
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.lighting.refracted_light import RefractedLighting, RefractedSamples, VertexBeforeGlass
 from mivol.transport.path.estimators import Settings
@@ -53,6 +54,17 @@ def fog(sigma_t: float = 2.0) -> dict:
     return medium("homogeneous", sigma_t, 0.9)
 
 
+def sun_in_a_map(width: float = 8.0) -> dict:
+    """An even sky with a soft sun of this angle [degrees] above the camera."""
+    theta, phi = np.pi * (np.arange(32)[:, None] + 0.5) / 32, 2 * np.pi * (np.arange(64) + 0.5) / 64
+    d = np.stack(np.broadcast_arrays(np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)), axis=-1)
+    angle = np.degrees(np.arccos(np.clip(d @ [0.48, 0.6, 0.64], -1, 1)))
+    radiance = 0.2 + 60 * np.exp(-0.5 * (angle / width) ** 2)
+    pixels = np.repeat(radiance[..., None], 3, axis=2).astype(np.float32)
+    turn = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    return {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": turn}
+
+
 SCENES = {
     "ball": lambda: {"ball": {"type": "sphere", "bsdf": glass(), "interior": fog()}, "lamp": lamp(0.5)},
     "two lamps and a floor in a tank": lambda: {
@@ -66,6 +78,15 @@ SCENES = {
         "outer": {"type": "sphere", "radius": 1.1, "bsdf": glass()},
         "inner": {"type": "sphere", "radius": 0.9, "bsdf": glass(1.33, IOR), "interior": fog()},
         "lamp": lamp(0.5),
+    },
+    "a tank under a sun": lambda: {
+        "tank": {"type": "cube", "to_world": box((0.9, 0.9, 0.9)), "bsdf": glass(1.33), "interior": fog()},
+        "sun": sun_in_a_map(),
+    },
+    "a lamp and a sun": lambda: {
+        "ball": {"type": "sphere", "bsdf": glass(), "interior": fog()},
+        "lamp": lamp(0.5, radiance=30.0),
+        "sun": sun_in_a_map(),
     },
     "fog behind a pane": lambda: {
         "pane": {"type": "cube", "to_world": box((1.5, 1.5, 0.05), 1.3), "bsdf": glass()},
@@ -202,6 +223,43 @@ def test_both_ways_share_the_light_by_their_densities(variant_rgb: str) -> None:
     assert weight(no, no) == weight(yes, yes) == weight(yes, no, mi.EmitterPtr(None)) == 1
 
 
+@pytest.mark.parametrize("lamps", [0, 2])
+def test_the_focus_of_a_map_counts_as_a_lamp(variant_rgb: str, lamps: int) -> None:
+    """The map has half of the choices beside lamps, and the last number."""
+    parts = {"ball": {"type": "sphere", "bsdf": glass()}, "sun": sun_in_a_map(), "a": lamp(0.3), "b": lamp(0.3, (-2, 1, 1))}
+    parts = {name: part for name, part in parts.items() if lamps or name not in ("a", "b")}
+    fog_aside = {"type": "sphere", "center": [9, 0, 0], "bsdf": {"type": "null"}, "interior": fog()}
+    scene = mi.load_dict({"type": "scene", **parts, "aside": fog_aside, "sensor": camera([0, -4, 0], [0, 0, 0], 4)})
+    direct = DirectLighting(media_of(scene), bright=MapReading().follow(scene).table)
+    lighting = RefractedLighting.of_lamps(direct, 8)
+    u = (dr.arange(mi.Float, 1000) + 0.5) / 1000
+    it = dr.zeros(mi.Interaction3f, 1000)
+    chosen = np.array(lighting._choose(it, u))
+    share = [float(lighting._probability(it, mi.UInt32(k))[0]) for k in range(lamps + 1)]
+    np.testing.assert_allclose(np.bincount(chosen, minlength=lamps + 1) / 1000, share, atol=2e-3)
+    assert share[-1] == (0.5 if lamps else 1.0)
+    number, known = lighting._number_of(mi.EmitterPtr(scene.environment()))
+    assert (int(number[0]), bool(known[0])) == (lamps, True)
+    # The map was turned by 90 degrees about x. Its rows of pixels are pi / 32 apart.
+    axis, g = lighting._aim(at(0, 0, 0), mi.UInt32(lamps), mi.Bool(True))
+    assert float(g[0]) == pytest.approx(1 - 0.7 * float(direct.bright.focus[3]), rel=1e-3)
+    np.testing.assert_allclose(np.ravel(axis), [0.48, -0.64, 0.6], atol=np.pi / 64)
+
+
+def test_nothing_is_drawn_without_lamps(variant_rgb: str) -> None:
+    parts = {"ball": {"type": "sphere", "bsdf": glass(), "interior": fog()}, "sky": sky(1.0)}
+    scene = mi.load_dict({"type": "scene", **parts, "sensor": camera([0, -4, 0], [0, 0, 0], 4)})
+    assert RefractedLighting.of_lamps(DirectLighting(media_of(scene)), 8) is None
+
+
+def test_a_map_with_gradients_is_met_by_chance(draws: None, variant_rgb: str) -> None:
+    """Its pixels are not read then."""
+    scene = load("a tank under a sun", res=4)
+    params = mi.traverse(scene)
+    dr.enable_grad(params["sun.data"])
+    assert np.mean(mi.render(scene, params, integrator=mi.load_dict(mivol(max_depth=4)), spp=4)) > 0.1
+
+
 def test_mirrors_and_glass_are_told_apart() -> None:
     mi.set_variant("llvm_ad_rgb")
     first = VertexBeforeGlass.none(2)
@@ -236,7 +294,7 @@ def test_derivatives_meet_lamps_by_chance(draws: None, variant_rgb: str) -> None
 
 def facts(**changed: object) -> SimpleNamespace:
     film = {"are_samples_independent": True, "is_colour_film": True, "film_samples": choices.MIN_LAMP_SAMPLES}
-    return SimpleNamespace(**{"has_glass": True, "has_lamps": True, **film, **changed})
+    return SimpleNamespace(**{"has_glass": True, "has_lamps": True, "emitters": (), **film, **changed})
 
 
 def test_a_preview_needs_glass_lamps_and_samples() -> None:
@@ -246,6 +304,7 @@ def test_a_preview_needs_glass_lamps_and_samples() -> None:
     assert is_open()
     for name in ("has_glass", "has_lamps", "are_samples_independent", "is_colour_film"):
         assert not is_open(**{name: False})
+    assert is_open(has_lamps=False, emitters=("EnvironmentMapEmitter",))
     assert not is_open(depth=2)
     assert not is_open(segment="absorption")
     assert not is_open(film_samples=choices.MIN_LAMP_SAMPLES - 1)
@@ -261,7 +320,11 @@ def test_the_gain_counts_the_time_of_directions(gain: float, expected: bool) -> 
     assert unknown == (False, [])
 
 
-def test_explain_tells_how_lamps_behind_glass_are_met(variant_rgb: str) -> None:
-    said = explain(load("fog behind a pane", res=96), 6).partition("lamps behind glass")[2].partition("\n  images")[0]
+@pytest.mark.parametrize("name", ["fog behind a pane", "a tank under a sun"])
+def test_explain_tells_how_lamps_behind_glass_are_met(variant_rgb: str, name: str) -> None:
+    said = explain(load(name, res=96), 6).partition("lamps behind glass")[2].partition("\n  images")[0]
     assert "drawn through the glass" in said
+
+
+def test_small_images_measure_nothing(variant_rgb: str) -> None:
     assert "lamps behind glass" not in explain(load("fog behind a pane", res=8), 6)

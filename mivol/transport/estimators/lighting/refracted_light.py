@@ -225,12 +225,13 @@ class RefractedLighting:
     def _ball(self, it: mi.Interaction3f, number: mi.UInt32) -> tuple[mi.Point3f, mi.Float]:
         """Centre and radius of a lamp, as seen from a point [length]."""
         count, centre, radius = len(self.lamps.sampled), mi.Point3f(0), mi.Float(0)
+        is_map = number == count
         if count:
-            centre, radius = self.lamps.ball(number)
+            centre, radius = self.lamps.ball(dr.select(is_map, 0, number))
         if self._map is None:
             return centre, radius
         x, y, z, angle = (dr.gather(mi.Float, self._focus, mi.UInt32(k)) for k in range(4))
-        far, is_map = FAR * self.media.size, number == count
+        far = FAR * self.media.size
         return dr.select(is_map, it.p + far * mi.Vector3f(x, y, z), centre), dr.select(is_map, far * angle, radius)
 
     def _aim(self, it: mi.Interaction3f, number: mi.UInt32, active: mi.Bool) -> tuple[mi.Vector3f, mi.Float]:
