@@ -355,7 +355,7 @@ def measure_refracted_noise(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, su
             made = _build_for_images(scene, needs, replace(plan, draws_refracted_light=True), settings, survey)
             drawn = replace(plan.light_of_paths(made), glass="transmits")
             ways = replace(drawn, refracted=None), drawn
-            survey.refracted_noise[sensor.ptr] = RefractedNoise(*(_measure_pixel_variance(sensor, way) for way in ways))
+            survey.refracted_noise[sensor.ptr] = compare_refracted(*(_sample_pixels(sensor, way) for way in ways))
     return replace(needs, refracted_noise=survey.refracted_noise[sensor.ptr])
 
 
@@ -555,13 +555,32 @@ def _name_emitter(scene: mi.Scene, emitter: mi.Emitter, number: int) -> str:
 
 def _measure_pixel_variance(sensor: mi.Sensor, estimators: Estimators) -> float:
     """Variance of one sample in a pixel, mean over pixels spread over the film."""
+    return _mean_variance(_sample_pixels(sensor, estimators))
+
+
+def _mean_variance(L: NDArray) -> float:
+    return float(L.var(axis=1, ddof=1).mean())
+
+
+def _sample_pixels(sensor: mi.Sensor, estimators: Estimators) -> NDArray:
+    """Mean radiance over all colours of each sample (pixels, LAMP_SAMPLES), in pixels spread over the film."""
     pixel, size, cells = _middle_pixels(sensor, LAMP_SIDE)
     n = cells * LAMP_SAMPLES
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(CELL_SEED, n)
     place = (mi.Point2f(pixel(dr.arange(mi.UInt32, n) // LAMP_SAMPLES)) + sampler.next_2d()) / size
-    L = _walk_from(sensor, estimators, sampler, place)
-    return float(L.reshape(cells, LAMP_SAMPLES).var(axis=1, ddof=1).mean())
+    return _walk_from(sensor, estimators, sampler, place).reshape(cells, LAMP_SAMPLES)
+
+
+def compare_refracted(by_chance: NDArray, drawn: NDArray) -> RefractedNoise:
+    """The noise of samples (pixels, n) by chance and of samples with directions through glass.
+
+    If none of N samples meets a lamp by chance, the lamp has a share of at most about 1 / N of the samples. Light that is
+    missing by more than two standard errors then stands for the noise: N times the square of the difference of the means.
+    """
+    noise, other = _mean_variance(by_chance), _mean_variance(drawn)
+    missed = by_chance.size * np.square(by_chance.mean() - drawn.mean()) - 4 * (noise + other)
+    return RefractedNoise(max(noise, float(missed)), other)
 
 
 def _middle_pixels(sensor: mi.Sensor, side: int) -> tuple[Callable[[mi.UInt32], mi.Vector2u], mi.ScalarVector2f, int]:

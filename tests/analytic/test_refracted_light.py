@@ -12,7 +12,7 @@ import pytest
 from scattering_scenes import assert_same_images, mivol, moments, volpath
 
 from mivol.experiments.script import explain
-from mivol.scene import choices, plan
+from mivol.scene import choices, plan, previews
 from mivol.scene.needs import find_needs
 from mivol.scene.survey import RefractedNoise, survey_scene
 from mivol.transport.estimators.lighting.bright_map import MapReading
@@ -308,6 +308,14 @@ def test_a_preview_needs_glass_lamps_and_samples() -> None:
     assert not is_open(depth=2)
     assert not is_open(segment="absorption")
     assert not is_open(film_samples=choices.MIN_LAMP_SAMPLES - 1)
+
+
+def test_light_that_chance_missed_counts_as_noise() -> None:
+    """Samples of 1 and 3 in turns have the variance 4 / 3 in pairs of pixels; black ones miss a mean of 2 in 8 samples."""
+    drawn = np.tile([1.0, 3.0], (2, 2))
+    assert previews.compare_refracted(drawn, drawn) == RefractedNoise(pytest.approx(4 / 3), pytest.approx(4 / 3))
+    missed = previews.compare_refracted(0 * drawn, drawn)
+    assert missed == RefractedNoise(pytest.approx(8 * 4 - 4 * 4 / 3), pytest.approx(4 / 3))
 
 
 @pytest.mark.parametrize(("gain", "expected"), [(1.19, False), (1.21, True)])
