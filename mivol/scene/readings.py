@@ -187,6 +187,7 @@ class PartReading:
         floored: the values with 0 in place of negative values; None without negative values.
         empty_distances, trims, block_ranges: as in :class:`mivol.transport.traversal.lattice.Lattice`.
         rough, rough_distances: means of blocks of voxels, and their own ``empty_distances``.
+        largest: largest value of a grey grid.
     """
 
     floored: mi.Float | None = None
@@ -195,6 +196,7 @@ class PartReading:
     block_ranges: BlockRanges | None = None
     rough: mi.TensorXf | None = None
     rough_distances: mi.UInt32 | None = None
+    largest: mi.Float | None = None
 
     def apply(self, part: ExactExtinction) -> None:
         """Give the reading to a part."""
@@ -204,6 +206,8 @@ class PartReading:
             part.lattice.empty_distances, part.lattice.trims = self.empty_distances, self.trims
         if self.block_ranges is not None:
             part.lattice.block_ranges = self.block_ranges
+        if self.largest is not None:
+            part.largest = self.largest
         if self.rough is not None:
             shift = block_shift(part.lattice.res)
             part.rough = GridExtinction(part.name, place_blocks(part.lattice, self.rough, shift, self.rough_distances))
@@ -242,6 +246,8 @@ def read_part(
     if draws_near_light:
         coarse = read_coarse_grid(survey, lattice, block_shift(lattice.res), False).lattice
         reading.rough, reading.rough_distances = coarse.values, coarse.empty_distances
+        if part.channels == 1:
+            reading.largest = read_largest(part, survey, name)
     return reading
 
 
@@ -274,6 +280,16 @@ def read_block_ranges(part: ExactExtinction, survey: SceneSurvey, name: str) -> 
         return tabulate_ranges(extremes if extremes.shift == block_shift(part.lattice.res) else extremes.join())
 
     return _read_once(survey, ("blocks",), dr.detach(values.array), make)
+
+
+def read_largest(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.Float:
+    """Read the largest value of a grid, once for each state of the array."""
+    array = dr.detach(part.lattice.values.array)
+
+    def make() -> mi.Float:
+        return dr.max(array) if is_recording() else dr.opaque(mi.Float, read_extinction(part, survey, name).maximum)
+
+    return _read_once(survey, ("largest",), array, make)
 
 
 def read_coarse_grid(survey: SceneSurvey, lattice: Lattice, shift: int, finds_occupied: bool) -> CoarseGrid:

@@ -303,10 +303,12 @@ class GridExtinction(NodeValues):
 
     Attributes:
         rough: the means of blocks of voxels as a grid of their own, for drawing distances; None without one.
+        largest: largest value, for look-ups in place of a walk (:func:`.tracking.ratio_tracking_in_grid`); None to walk.
         floored: the values with 0 in place of negative values; None without negative values.
     """
 
     rough: GridExtinction | None = None
+    largest: mi.Float | None = None
     floored: mi.Float | None = None
     activation: ClassVar[None] = None
 

@@ -242,6 +242,7 @@ class DirectLighting:
         active: mi.Bool,
         rng: mi.UInt32 | None = None,
         known: tuple[mi.Float, mi.Bool] | None = None,
+        looks_up: bool = False,
     ) -> DirectSample:
         """Estimate the direct light at a vertex of a path by one emitter sample; the path's next segment is the second sample.
 
@@ -252,6 +253,7 @@ class DirectLighting:
             active: lanes to estimate.
             rng: state of the random number generator for an estimated shadow; None means an exact shadow.
             known: ``T`` of the same sample in an earlier walk, and lanes with such a sample.
+            looks_up: as of :func:`.shadow_rays.find_transmittance`.
 
         Bias: none. Variance: one emitter sample. Cost: one shadow ray.
         """
@@ -270,7 +272,7 @@ class DirectLighting:
             inside = on & vertex.in_medium
             number = self.emitters.number_of(sample.emitter)
             shadow, traced = TabulatedShadow.look_up(self.shadow_table, start, medium, direct, number, inside), on & ~inside
-        ray_segment, clear, tau, light = trace_shadow_ray(self.media, start, medium, direct, traced, rng)
+        ray_segment, clear, tau, light = trace_shadow_ray(self.media, start, medium, direct, traced, rng, looks_up)
         if known is not None:
             tau, light, clear = None, dr.select(is_known, known[0], light), dr.select(is_known, known[0] > 0, clear)
         on &= clear

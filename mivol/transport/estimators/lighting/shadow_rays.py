@@ -9,16 +9,17 @@ References: Arvo & Kirk 1990 (Russian roulette).
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import minimum
-from mivol.transport.estimators.flights.tracking import ratio_tracking, residual_ratio_tracking
+from mivol.transport.estimators.flights.tracking import ratio_tracking, ratio_tracking_in_grid, residual_ratio_tracking
 from mivol.transport.media.extinction import to_scene_channels, to_spectrum
-from mivol.transport.media.grid_extinction import clip_interval
-from mivol.transport.media.optical_depth import integrate_optical_depth, segment_optical_depth, transmittance
+from mivol.transport.media.grid_extinction import GridExtinction, clip_interval
+from mivol.transport.media.optical_depth import integrate_optical_depth, transmittance
 from mivol.transport.media.ray_intervals import (
     OWN_SURFACE,
     MediumInterval,
@@ -28,7 +29,7 @@ from mivol.transport.media.ray_intervals import (
     visit_media,
 )
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.random_numbers import draw_pcg32
+from mivol.transport.traversal.random_numbers import draw_pcg32, fork_state
 from mivol.transport.traversal.rays import FineRay, Ray
 
 __all__ = [
@@ -57,6 +58,7 @@ def find_transmittance(
     active: mi.Bool,
     rng: mi.UInt32 | None,
     ends_at_light: bool = False,
+    looks_up: bool = False,
 ) -> tuple[SegmentEnd, list[mi.Float] | None, list[mi.Float] | None, mi.Spectrum]:
     """Follow a ray to the first opaque surface, and find its transmittance.
 
@@ -69,6 +71,7 @@ def find_transmittance(
             the scene, by roulette otherwise; None means the exact transmittance.
         ends_at_light: whether the light comes from ``ray.maxt``, and a surface in front makes the result useless. Rays through
             dark homogeneous media are then not traced.
+        looks_up: whether a few look-ups may estimate the transmittance of thin grids (:class:`_SparseTransmittance`).
 
     Returns:
         The end of the ray; its optical depth for each channel [1], or None if tracking has estimated the transmittance; the
@@ -80,14 +83,22 @@ def find_transmittance(
         return end, None, None, T * end.null_transmission
     enough = NEGLIGIBLE_TAU if rng is None else ROULETTE_TAU - dr.log(draw_pcg32(rng, 1)[1][0])
     stops = enough if ends_at_light or not media.is_homogeneous else None
-    end, tau, passages = integrate_optical_depth(media, ray, medium, active, stops, passes_null=True)
+    if looks_up:
+        sparse = _SparseTransmittance(media, stops)
+        end, (tau, T, _) = visit_media(
+            media, ray, medium, sparse.visit, sparse.start(dr.width(ray), fork_state(rng, 1)), active, True, sparse.reach
+        )
+        passages = None
+    else:
+        end, tau, passages = integrate_optical_depth(media, ray, medium, active, stops, passes_null=True)
+        T = mi.Float(1)
     if rng is None:
         return end, tau, passages, transmittance(tau) * end.null_transmission
     # Every channel is divided by the survival probability of the clearest channel, so weights stay below 1.
     clearest = minimum(tau)
     thicker = [t - dr.maximum(clearest - ROULETTE_TAU, 0) for t in tau]
     light = dr.select(clearest <= enough, transmittance(thicker), 0)
-    return end, tau, passages, light * end.null_transmission
+    return end, None if looks_up else tau, passages, light * T * end.null_transmission
 
 
 def estimate_transmittance(
@@ -100,11 +111,67 @@ def estimate_transmittance(
 
 
 def segment_transmittance(media: SceneMedia, segment: RaySegment, active: mi.Bool, rng: mi.UInt32) -> mi.Spectrum:
-    """Transmittance of the media along a segment of known length [1]: estimated if the media estimate shadows, else exact."""
+    """Transmittance of the media along a segment of known length [1]: estimated if the media estimate shadows, by a few
+    look-ups in thin grids, otherwise exact."""
     if not media.tracks_shadows:
-        return transmittance(segment_optical_depth(media, segment, active))
+        sparse = _SparseTransmittance(media)
+        tau, T, _ = revisit_media(media, segment, sparse.visit, sparse.start(dr.width(segment.ray), rng), active, anywhere=True)
+        return transmittance(tau) * T
     start = ([mi.Float(1) for _ in range(media.channels)], rng)
     return to_spectrum(revisit_media(media, segment, _multiply_transmittance, start, active, anywhere=True)[0])
+
+
+CELLS_PER_LOOKUP = 1.0
+"""Steps of a walk of cells that take as long as a look-up at a random point [1]."""
+
+GRID_LOOKUP_RATE = 2.0
+"""Look-ups for each unit of the largest optical depth along a ray in a thin grid."""
+
+
+@dataclass
+class _SparseTransmittance:
+    """The transmittance of media along a ray, from few look-ups in thin grids and a walk of other media.
+
+    A grid is thin if look-ups cost less than a walk of its cells.
+
+    Attributes:
+        media: media of the scene.
+        enough: as of :func:`.optical_depth.integrate_optical_depth`.
+    """
+
+    media: SceneMedia
+    enough: float | mi.Float | None = None
+
+    def start(self, width: int, rng: mi.UInt32) -> tuple:
+        """The state of a walk: optical depth of walked media for each channel [1], transmittance of others, generator."""
+        return [dr.zeros(mi.Float, width) for _ in range(self.media.channels)], dr.full(mi.Float, 1, width), mi.UInt32(rng)
+
+    def visit(self, state: tuple, interval: MediumInterval) -> tuple:
+        tau, T, rng = state
+        body, channels = interval.body, self.media.channels
+        grids = [p for p in body.exact_parts if isinstance(p, GridExtinction) and p.largest is not None]
+        others = [p for p in body.view.parts if not any(p is q for q in grids)]
+        rows = body.optical_depth(interval, channels, others, self.enough) if others else []
+        tau = [t + d for t, d in zip(tau, rows, strict=True)] if others else tau
+        scale = dr.detach(body.view.scale) * body.area(interval.ray.d)
+        for part in grids:
+            segment, rate = clip_interval(part.lattice, interval), GRID_LOOKUP_RATE * scale * part.largest
+            # A walk passes 3 / 2 cells on the way of a cell's edge, on average over the directions.
+            is_thin = rate < CELLS_PER_LOOKUP * 1.5 * dr.norm(segment.d)
+            lanes = interval.active & is_thin & (rate > 0)
+            own, rng = ratio_tracking_in_grid(part.lattice, segment, scale, dr.select(lanes, rate, 1), rng, lanes)
+            T *= own
+            walked = replace(interval, active=interval.active & ~is_thin)
+            rows = body.optical_depth(walked, channels, [part], self.enough)
+            tau = [t + d for t, d in zip(tau, rows, strict=True)]
+        return tau, T, rng
+
+    @property
+    def reach(self) -> Callable[[tuple], mi.Float64] | None:
+        """The distance at which a ray may end, as of :func:`.ray_intervals.visit_media`."""
+        if self.enough is None:
+            return None
+        return lambda state: mi.Float64(dr.select(minimum(state[0]) > self.enough, 0, dr.inf))
 
 
 def _multiply_transmittance(state: tuple, interval: MediumInterval) -> tuple:
@@ -143,6 +210,7 @@ def trace_shadow_ray(
     direct: mi.DirectionSample3f,
     active: mi.Bool,
     rng: mi.UInt32 | None = None,
+    looks_up: bool = False,
 ) -> tuple[RaySegment, mi.Bool, list[mi.Float] | None, mi.Spectrum]:
     """Follow the ray from a point to a point of an emitter.
 
@@ -151,7 +219,7 @@ def trace_shadow_ray(
         start: origin of the ray.
         medium: medium around the origin.
         direct: Mitsuba's sample of the emitter.
-        active, rng: as in :func:`find_transmittance`.
+        active, rng, looks_up: as in :func:`find_transmittance`.
 
     Returns:
         The shadow ray, lanes in which no opaque surface blocks it, and its optical depth and transmittance as in
@@ -165,8 +233,8 @@ def trace_shadow_ray(
     ray = FineRay.from_point(start, dr.normalize(away), direct, length)
     if media.has_solid_surfaces:
         clear = ~media.find_blocked(replace(ray, maxt=length * OWN_SURFACE), active)
-        _, tau, passages, light = find_transmittance(media.alone, ray, medium, active & clear, rng, True)
+        _, tau, passages, light = find_transmittance(media.alone, ray, medium, active & clear, rng, True, looks_up)
     else:
-        stop, tau, passages, light = find_transmittance(media, ray, medium, active, rng, True)
+        stop, tau, passages, light = find_transmittance(media, ray, medium, active, rng, True, looks_up)
         clear = ~(stop.si.is_valid() & (stop.t < length * OWN_SURFACE))
     return RaySegment(ray, medium, length, True, u, passages), clear, tau, light

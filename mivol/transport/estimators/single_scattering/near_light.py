@@ -327,7 +327,7 @@ class NearLighting:
         sample = self.direct.sample_near_emitter(mei, chosen, samples.emitter, event.on)
         vertex = MediumVertex(media, mei, point_along(ray, event.t))
         shadows = None if known is None else (known[0].shadow, known[1])
-        direct = self.direct.estimate_at_vertex(vertex, sample, attached, event.on, candidate.rng, shadows)
+        direct = self.direct.estimate_at_vertex(vertex, sample, attached, event.on, candidate.rng, shadows, True)
         sigma_t, sigma_s = event_coefficients(media, ray, event, mei, proposal.is_exact)
         light = ScatteredLight(media, segment, Scattering(event, mei, gain, [direct], sigma_t, sigma_s, chance))
         shadow = DirectLight(media, direct.ray_segment, light.value, direct.on)
