@@ -267,7 +267,7 @@ def ratio_tracking_in_grid(
     width = dr.width(length)
     start = (dr.zeros(mi.Float, width), dr.full(mi.Float, 1, width), mi.UInt32(rng), active & (length > 0))
     _, T, rng, _ = dr.while_loop(start, lambda s, T, rng, on: on, step, label="points of a grid")
-    return dr.maximum(T, 0), rng
+    return T, rng
 
 
 def delta_tracking_in_blocks(

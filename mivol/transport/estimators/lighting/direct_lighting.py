@@ -242,7 +242,7 @@ class DirectLighting:
         active: mi.Bool,
         rng: mi.UInt32 | None = None,
         known: tuple[mi.Float, mi.Bool] | None = None,
-        looks_up: bool = False,
+        looks_up: mi.Bool | None = None,
     ) -> DirectSample:
         """Estimate the direct light at a vertex of a path by one emitter sample; the path's next segment is the second sample.
 

@@ -303,6 +303,8 @@ class NearLighting:
         everywhere = active & segment.may_scatter
         on = everywhere if known is None else everywhere & ~known[1]
         rng, (chance,) = draw_pcg32(samples.rng, 1)
+        # The light of camera rays has little noise in images, so the noise of look-ups would show.
+        looks_up = mi.Bool(True) if self.probe_depth else segment.depth > 0
         # -- The distance ------------------------------------------------------------------------------------------------
         chosen = self.emitters.choose_emitter(ray, samples.which_emitter)
         proposal = DistanceProposal(media, ray, chosen, None, self.probe_depth, is_rough=True)
@@ -313,7 +315,7 @@ class NearLighting:
         T = transmittance(event.tau)
         if not proposal.is_exact:
             before = RaySegment.upto(ray, segment.medium, event.t)
-            T = segment_transmittance(media, before, event.on, fork_state(candidate.rng, 1))
+            T = segment_transmittance(media, before, event.on, fork_state(candidate.rng, 1), looks_up)
         reach = dr.select(event.on, T / event.pdf, 0)
         if known is not None:
             place, is_known = known
@@ -327,7 +329,7 @@ class NearLighting:
         sample = self.direct.sample_near_emitter(mei, chosen, samples.emitter, event.on)
         vertex = MediumVertex(media, mei, point_along(ray, event.t))
         shadows = None if known is None else (known[0].shadow, known[1])
-        direct = self.direct.estimate_at_vertex(vertex, sample, attached, event.on, candidate.rng, shadows, True)
+        direct = self.direct.estimate_at_vertex(vertex, sample, attached, event.on, candidate.rng, shadows, looks_up)
         sigma_t, sigma_s = event_coefficients(media, ray, event, mei, proposal.is_exact)
         light = ScatteredLight(media, segment, Scattering(event, mei, gain, [direct], sigma_t, sigma_s, chance))
         shadow = DirectLight(media, direct.ray_segment, light.value, direct.on)
