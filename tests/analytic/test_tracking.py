@@ -25,6 +25,7 @@ from mivol.transport.estimators.flights.tracking import (
     delta_tracking,
     delta_tracking_in_blocks,
     ratio_tracking,
+    ratio_tracking_in_grid,
     residual_ratio_tracking,
 )
 from mivol.transport.estimators.scores import IMAGE
@@ -80,12 +81,19 @@ def start(number: float) -> mi.Float:
     return mi.Float((number + fresh(0) * 0.6180339887498949) % 1)
 
 
-def estimates(lattice: Lattice, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """[channel, repeat, ray] estimates along random rays, and [channel, ray] exact transmittances in float64."""
+def estimates(lattice: Lattice, scale: float = 1.0, rate: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """[channel, repeat, ray] estimates along random rays, and [channel, ray] exact transmittances in float64.
+
+    With a ``rate`` [1/length] the estimates are those of look-ups without a walk.
+    """
     o, d = (np.tile(v, (REPEATS, 1)).T for v in aimed(7, RAYS))
     o, d = mi.Point3f(o), mi.Vector3f(d)
     n, segment = RAYS * REPEATS, clip_to_grid(lattice, o, d, 0, dr.inf)
-    found, _ = residual_ratio_tracking(lattice, segment, mi.Float(scale), seed_pcg32(start(0.3), n), mi.Bool(True))
+    rng, on = seed_pcg32(start(0.3), n), mi.Bool(True)
+    if rate is None:
+        found, _ = residual_ratio_tracking(lattice, segment, mi.Float(scale), rng, on)
+    else:
+        found = [ratio_tracking_in_grid(lattice, segment, mi.Float(scale), mi.Float(rate), rng, on)[0]]
     exact = integrate_segment(lattice, lattice.values.array, segment)
     T = [np.exp(-scale * np.array(t, dtype=np.float64)[:RAYS]) for t in exact]
     return np.array([np.array(f, dtype=np.float64).reshape(REPEATS, RAYS) for f in found]), np.array(T)
@@ -112,6 +120,34 @@ def test_estimates_have_the_exact_mean(name):
     variance = T * (1 - T)
     assert_means(found.mean(axis=1), T, variance, REPEATS)
     assert_means(found.mean(axis=(1, 2)), T.mean(axis=1), variance.mean(axis=1), RAYS * REPEATS)
+
+
+@pytest.mark.slow_for("rough")
+@pytest.mark.statistical
+@pytest.mark.parametrize("name", ["rough", "edges", "a sheet of voxels", "tau 1e-3"])
+def test_look_ups_have_the_exact_mean(name):
+    """With a scale, at the smallest rate, of which the values reach all."""
+    values = FIELDS[name]()
+    found, T = estimates(grid(values), scale=0.4, rate=0.4 * values.max() * (1 + 1e-6))
+    assert found.min() >= 0 and found.max() <= 1
+    assert_means(found.mean(axis=1), T, T * (1 - T), REPEATS)
+    assert_means(found.mean(axis=(1, 2)), T.mean(axis=1), (T * (1 - T)).mean(axis=1), RAYS * REPEATS)
+
+
+@pytest.mark.statistical
+def test_look_ups_vary_as_derived():
+    """T^2 (exp(tau sigma / rate) - 1) in a grid of one value, here with 4 look-ups for each unit of the optical depth."""
+    found, T = estimates(grid(np.full((9, 9, 9, 1), 0.5, np.float32)), rate=2.0)
+    second = T**2 * np.exp(-np.log(T) / 4)
+    assert_means((found**2).mean(axis=1), second, second * (1 - second), REPEATS)
+
+
+def test_look_ups_leave_out_lanes_that_are_off():
+    lattice, (o, d) = grid(FIELDS["rough"]()), (mi.Point3f(0, 0, -5), mi.Vector3f(0, 0, 1))
+    segment = clip_to_grid(lattice, o, d, 0, dr.inf)
+    on = mi.Bool([True, False])
+    T, _ = ratio_tracking_in_grid(lattice, segment, mi.Float(1), mi.Float(1e3), seed_pcg32(start(0.1), 2), on)
+    assert T[0] < 1 and T[1] == 1
 
 
 @pytest.mark.statistical

@@ -7,12 +7,19 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scattering_scenes as small
-from false_alarms import assert_rate, fresh
+from false_alarms import Estimate, assert_rate, assert_same_mean, fresh
 from scattering_scenes import PLACE, close_up, point
 from volpath_scenes import EMITTERS, RED, area, behind_a_mask, cube, grid_in, same, square
 
-from mivol.transport.estimators.lighting.shadow_rays import ROULETTE_TAU, find_transmittance
-from mivol.transport.traversal.random_numbers import seed_pcg32
+from mivol.transport.estimators.lighting.shadow_rays import (
+    LOOKUPS,
+    ROULETTE_TAU,
+    STEPS_PER_LOOKUP,
+    find_transmittance,
+    segment_transmittance,
+)
+from mivol.transport.media.ray_intervals import RaySegment
+from mivol.transport.traversal.random_numbers import fork_state, seed_pcg32
 from scenes import box_of, grid_volume, media_of, medium
 
 
@@ -93,3 +100,50 @@ def test_a_ray_that_ends_is_walked_no_further():
     _, tau = through(np.full((2, 2, 32, 1), 32.0, np.float32), True)
     # A cell has a depth of 2, and a limit of 1 + ln(2^24) = 17.6 at most is passed by one cell.
     assert tau.min() > ROULETTE_TAU and tau.max() < 20 and tau.mean() < 5
+
+
+# -- Look-ups in thin grids ------------------------------------------------------------------------------------------------
+
+CELLS = 24
+THINNEST = 1.5 * (CELLS / 2) / (LOOKUPS * STEPS_PER_LOOKUP)
+"""Extinction [1/length] below which look-ups cost less than a walk of a grid of ``CELLS`` cells of length 2 / ``CELLS``."""
+
+
+def looked_up(sigma: float, looks_up: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    """Transmittances (N) along one ray through fog and a grid of one value: as a shadow ray and as a segment of a path,
+    with the generators of near light.
+    """
+    grid = grid_volume("mivol_voxels", np.full((CELLS, CELLS, CELLS, 1), sigma, np.float32), PLACE)
+    smoke = box_of(medium("mivol_medium", grid, 0.5), PLACE)
+    behind = np.array(PLACE)
+    behind[0, 3] += 2.5
+    fog = box_of(medium("mivol_medium", 0.2, 0.5), behind)
+    media = media_of(close_up({"smoke": smoke, "fog": fog}, res=1))
+    part = next(p for body in media.bodies for p in body.view.parts if p.lattice is not None)
+    part.largest = mi.Float(sigma)
+    ray = mi.Ray3f(dr.full(mi.Point3f, 0, N) + mi.Point3f(-2, 0.1, 0.2), mi.Vector3f(1, 0, 0), 10, mi.Float(0), mi.Color0f())
+    nowhere, on = dr.zeros(mi.MediumPtr, N), mi.Bool(looks_up)
+    rng = seed_pcg32(mi.Float((0.3 + 0.618 * fresh(0)) % 1), N)
+    _, _, _, shadow = find_transmittance(media, ray, nowhere, mi.Bool(True), rng, looks_up=on)
+    along = segment_transmittance(media, RaySegment(ray, nowhere, mi.Float(10)), mi.Bool(True), fork_state(rng, 1), on)
+    return np.array(shadow[0], np.float64), np.array(along[0], np.float64)
+
+
+@pytest.mark.statistical
+def test_look_ups_of_a_shadow_and_of_a_segment_are_independent():
+    """The mean of their product is the product of the means: with the same look-ups it would be exp(tau / LOOKUPS) times as
+    large. The square of the product has the mean T^4 exp(2 tau / LOOKUPS).
+    """
+    tau, beyond = 0.9 * THINNEST * 2, 0.4
+    shadow, along = looked_up(0.9 * THINNEST)
+    T = np.exp(-tau - beyond)
+    assert len(np.unique(along)) > 10
+    for found, mean in ((along, T), (shadow, T), (shadow * along, T * T)):
+        of_lanes = Estimate(found.mean(), found.var(ddof=1) / found.size, found.size - 1)
+        assert_same_mean(of_lanes, mean, what="transmittance")
+
+
+def test_dense_grids_and_other_lanes_are_walked():
+    for sigma, looks_up in ((1.1 * THINNEST, True), (0.9 * THINNEST, False)):
+        _, along = looked_up(sigma, looks_up)
+        np.testing.assert_allclose(along, np.exp(-2 * sigma - 0.4), rtol=1e-5)
