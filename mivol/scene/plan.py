@@ -473,7 +473,7 @@ def build_estimators(
     near = None
     if draws_near_light:
         inside = [scene.emitters()[number] for number in plan.near_emitters]
-        near = NearLighting(direct, 0.0 if for_images else PROBE_DEPTH, inside)
+        near = NearLighting(direct, 0.0 if for_images else PROBE_DEPTH, inside, settings.shadows != "exact")
     mirrored = None
     if for_images and plan.keeps_mirrors:
         with dr.suspend_grad():

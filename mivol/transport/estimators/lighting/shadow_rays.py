@@ -1,8 +1,8 @@
 r"""Shadow rays: the transmittance of media, and of surfaces transmitting part of the light without deviation.
 
-The transmittance is exact or an unbiased estimate: by residual ratio tracking in grids with block ranges
-(:mod:`mivol.transport.estimators.flights.tracking`), or by Russian roulette along the ray. Beyond an optical depth
-:math:`\tau_0`, a ray survives with the probability :math:`e^{-(\tau - \tau_0)}`, and transmits :math:`e^{-\tau_0}`.
+The transmittance is exact or an unbiased estimate: by residual ratio tracking in grids with block ranges, by ratio tracking
+in thin grids (:mod:`mivol.transport.estimators.flights.tracking`), or by Russian roulette along the ray. Beyond an optical
+depth :math:`\tau_0`, a ray survives with the probability :math:`e^{-(\tau - \tau_0)}`, and transmits :math:`e^{-\tau_0}`.
 
 References: Arvo & Kirk 1990 (Russian roulette).
 """
@@ -20,7 +20,7 @@ from mivol.transport.estimators.flights.tracking import ratio_tracking, ratio_tr
 from mivol.transport.media.body import Body
 from mivol.transport.media.extinction import to_scene_channels, to_spectrum
 from mivol.transport.media.grid_extinction import GridExtinction, clip_interval
-from mivol.transport.media.optical_depth import integrate_optical_depth, transmittance
+from mivol.transport.media.optical_depth import integrate_optical_depth, segment_optical_depth, transmittance
 from mivol.transport.media.ray_intervals import (
     OWN_SURFACE,
     MediumInterval,
@@ -86,7 +86,7 @@ def find_transmittance(
     enough = NEGLIGIBLE_TAU if rng is None else ROULETTE_TAU - dr.log(draw_pcg32(rng, 1)[1][0])
     stops = enough if ends_at_light or not media.is_homogeneous else None
     looked_up = None
-    if looks_up is not None and any(_grids_with_bound(body) for body in media.bodies):
+    if looks_up is not None and _has_bounds(media):
         sparse = _SparseTransmittance(media, looks_up, stops)
         start = sparse.start(dr.width(ray), fork_state(rng, SHADOW_NUMBERS))
         end, (tau, looked_up, _) = visit_media(media, ray, medium, sparse.visit, start, active, True, sparse.reach)
@@ -114,11 +114,13 @@ def estimate_transmittance(
 
 
 def segment_transmittance(
-    media: SceneMedia, segment: RaySegment, active: mi.Bool, rng: mi.UInt32, looks_up: mi.Bool
+    media: SceneMedia, segment: RaySegment, active: mi.Bool, rng: mi.UInt32, looks_up: mi.Bool | None = None
 ) -> mi.Spectrum:
     """Transmittance of the media along a segment of known length [1]: estimated if the media estimate shadows, by a few
     look-ups in thin grids where ``looks_up``, otherwise exact."""
     if not media.tracks_shadows:
+        if looks_up is None or not _has_bounds(media):
+            return transmittance(segment_optical_depth(media, segment, active))
         sparse = _SparseTransmittance(media, looks_up)
         tau, T, _ = revisit_media(media, segment, sparse.visit, sparse.start(dr.width(segment.ray), rng), active, anywhere=True)
         return transmittance(tau) * T
@@ -140,6 +142,10 @@ SHADOW_NUMBERS = 2
 def _grids_with_bound(body: Body) -> list[GridExtinction]:
     """The grids of a medium with a known largest value."""
     return [part for part in body.exact_parts if isinstance(part, GridExtinction) and part.largest is not None]
+
+
+def _has_bounds(media: SceneMedia) -> bool:
+    return any(_grids_with_bound(body) for body in media.bodies)
 
 
 @dataclass

@@ -213,6 +213,7 @@ class NearLighting:
         direct: estimator of direct lighting.
         probe_depth: optical depth added over a medium for derivatives [1]; 0 for images.
         inside: emitters inside media that scatter. Directions are drawn around these emitters only.
+        looks_up: whether few look-ups may estimate transmittances of thin grids, behind camera rays and in derivatives.
 
     Attributes:
         emitters: the emitters with a position.
@@ -220,11 +221,11 @@ class NearLighting:
         aims: some emitter lies inside a medium.
 
     Bias: none. Variance: one distance and one point on one emitter. Cost: a walk of the segment, one up to the drawn distance,
-    and a shadow ray.
+    and a shadow ray; look-ups in place of the last two in thin grids.
     """
 
-    def __init__(self, direct: DirectLighting, probe_depth: float, inside: list[mi.Emitter]) -> None:
-        self.direct, self.media, self.probe_depth = direct, direct.media, probe_depth
+    def __init__(self, direct: DirectLighting, probe_depth: float, inside: list[mi.Emitter], looks_up: bool = True) -> None:
+        self.direct, self.media, self.probe_depth, self.looks_up = direct, direct.media, probe_depth, looks_up
         # Their tables are made here, outside of recorded loops.
         self.emitters = direct.near_emitters
         self.lights_vertices = bool(direct.far_emitters.sampled)
@@ -304,7 +305,9 @@ class NearLighting:
         on = everywhere if known is None else everywhere & ~known[1]
         rng, (chance,) = draw_pcg32(samples.rng, 1)
         # The light of camera rays has little noise in images, so the noise of look-ups would show.
-        looks_up = mi.Bool(True) if self.probe_depth else segment.depth > 0
+        looks_up = None
+        if self.looks_up:
+            looks_up = mi.Bool(True) if self.probe_depth else segment.depth > 0
         # -- The distance ------------------------------------------------------------------------------------------------
         chosen = self.emitters.choose_emitter(ray, samples.which_emitter)
         proposal = DistanceProposal(media, ray, chosen, None, self.probe_depth, is_rough=True)
