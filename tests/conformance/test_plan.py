@@ -117,7 +117,7 @@ def test_a_plan_holds_what_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     homogeneous = fog(occupied=0.0)
     asked = needs(thin, thick, homogeneous, film_samples=2**24 + 1, emitter_kinds=("extended",), surfaces=("Rectangle",),
                   boundaries=[SimpleNamespace(box="a box", hole=None)] * 3, are_emitters_far=False,
-                  has_lamps=False, emitter_distances=(0.2, 0.0, math.inf, 0.0))  # fmt: skip
+                  has_lamps=False, emitters=(), emitter_distances=(0.2, 0.0, math.inf, 0.0))  # fmt: skip
     made = plan.make_plan(asked, Settings(max_depth=2))
     assert (made.skips_empty, made.trims) == ((True, True, False), (False, True, False))
     assert made.estimates_shadows == (False, True, False)
@@ -160,6 +160,7 @@ def test_facts_with_the_same_key_have_the_same_decisions(monkeypatch: pytest.Mon
             "near_gain": 2.0,
             "surfaces": (),
             "has_lamps": False,
+            "emitters": (),
             "has_glass": False,
         }
         asked = needs(facts, boundaries=[SimpleNamespace(box="a box", hole=None, around=None)], are_emitters_far=False,
