@@ -44,7 +44,7 @@ from mivol.scene.survey import (
     is_instance,
     survey_scene,
 )
-from mivol.scene_graph import list_values, traverse
+from mivol.scene_graph import find_children, list_values, traverse
 from mivol.transport.estimators.lighting.emitters import find_bounding_ball
 from mivol.transport.media.body import Body
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
@@ -94,7 +94,7 @@ def find_needs(
         media=media,
         start=sensor.get_medium(),
         camera_inside=may_camera_be_inside(scene, sensor, survey),
-        **_sort_parameters(differentiated),
+        **_sort_parameters(differentiated, boundaries),
         film_samples=int(np.prod(sensor.film().size())) * samples,
         crop_samples=int(np.prod(sensor.film().crop_size())) * samples,
         spp=samples,
@@ -126,9 +126,14 @@ def read_media(boundaries: Sequence[Boundary], views: Sequence[MediumView], surv
     )
 
 
-def _sort_parameters(differentiated: Sequence[tuple[str, mi.Object]]) -> dict[str, tuple[str, ...]]:
-    """``Needs.parameters`` and ``Needs.places``."""
+def _sort_parameters(
+    differentiated: Sequence[tuple[str, mi.Object]], boundaries: Sequence[Boundary]
+) -> dict[str, tuple[str, ...] | bool]:
+    """``Needs.parameters``, ``Needs.places`` and ``Needs.follows_albedos``."""
+    media = [find_children(boundary.medium) for boundary in boundaries] if differentiated else []
+    albedos = {children["albedo"].ptr for children in media if "albedo" in children}
     return {
+        "follows_albedos": bool(differentiated) and all(owner.ptr in albedos for _, owner in differentiated),
         "parameters": tuple(key for key, _ in differentiated),
         "places": tuple(key for key, owner in differentiated if _is_placement(key, owner)),
     }
@@ -398,6 +403,7 @@ class Needs(ShapeFacts):
         camera_inside: whether the camera may be inside the box around a boundary.
         parameters: keys of the parameters with gradients enabled.
         places: keys among ``parameters`` that place shapes and sensors.
+        follows_albedos: the parameters with gradients enabled belong to volumes of the albedos of media.
         film_samples: pixels of the whole film times samples per pixel: a crop is planned as the whole film, so that it has the
             same pixels.
         crop_samples: the same of the crop that is rendered.
@@ -428,6 +434,7 @@ class Needs(ShapeFacts):
     camera_inside: bool
     parameters: tuple[str, ...]
     places: tuple[str, ...]
+    follows_albedos: bool
     film_samples: int
     crop_samples: int
     spp: int
@@ -462,7 +469,7 @@ class Needs(ShapeFacts):
         if any(m.emits or (may_scatter and not m.is_scattering) for m in self.media):
             return None
         unknown = {"lamp_noise": None, "branch_noise": None, "mirror_noise": None, "refracted_noise": None}
-        return replace(self, **unknown, **_sort_parameters(differentiated))
+        return replace(self, **unknown, **_sort_parameters(differentiated, self.boundaries))
 
     def follow_shapes(self, boundaries: tuple[Boundary, ...], facts: ShapeFacts) -> Needs:
         """The same facts of the same shapes in other places."""

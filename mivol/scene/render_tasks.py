@@ -30,7 +30,13 @@ from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_ao
 from mivol.transport.media.body import cuts_grids
 from mivol.transport.media.extinction import to_components
 from mivol.transport.media.phases import Phase, read_phase
-from mivol.transport.path.derivatives import carry_tangents, prepare_derivatives, replay_branches
+from mivol.transport.path.derivatives import (
+    carry_tangents,
+    collect_albedo_derivatives,
+    keeps_collisions,
+    prepare_derivatives,
+    replay_branches,
+)
 from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.film import (
     CameraRays,
@@ -291,12 +297,16 @@ class GradientTask(RenderTask):
             if constant is not None:
                 self._sum_tangents(estimators, constant, self.samples(sensor, arrays, seed), grad_in)
                 return
+            keeps = self.plan.branches and self.needs.follows_albedos and keeps_collisions(estimators)
             media.start_gradients(self.needs.crop_samples)
             # Deliver gradients of volumes after all passes: Dr.Jit follows the edge from a derived value to its parameter only
             # once.
             with dr.isolate_grad():
                 for rays, dL, daovs in adjoint_rays(self.samples(sensor, arrays, seed), self.aovs, grad_in):
-                    _replay(estimators, rays, dL, self.plan.branches)
+                    if keeps:
+                        collect_albedo_derivatives(estimators, rays, dL)
+                    else:
+                        _replay(estimators, rays, dL, self.plan.branches)
                     vjp_aovs(media, rays.ray, self.aovs, daovs)
                     dr.eval()
             with dr.resume_grad():

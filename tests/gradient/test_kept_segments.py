@@ -50,7 +50,7 @@ def two_balls() -> mi.Scene:
 SCENES = {
     "grid": (smoky, DENSITY),
     "floor": (lambda: smoky(floor=floor()), DENSITY),
-    "albedo": (lambda: smoky(floor=floor(), lit=sky(0.3)), ALBEDO),
+    "albedo": (lambda: smoky(floor=floor(), lit=sky(0.3)), (ALBEDO, SUN)),
     "rgb": (lambda: smoky(rgb=True, floor=floor()), DENSITY),
     "beside traced fog": (lambda: smoky(fog=ball("null"), floor=floor()), DENSITY),
     "beside fog in glass": (lambda: smoky(fog=ball("dielectric"), lit=sky(0.3)), DENSITY),
@@ -97,7 +97,7 @@ def test_a_replay_reads_its_flights_and_its_shadows(monkeypatch: pytest.MonkeyPa
         patch.setattr(KeptSegments, "shadow_at", lambda kept, index, active: (mi.Float(0), active))
         assert not np.any(gradient(smoky(), SUN))
     monkeypatch.setattr(KeptSegments, "flight_at", lambda *given: replace(flight_at(*given), t=mi.Float64(dr.inf)))
-    assert not np.any(gradient(smoky(), ALBEDO))
+    assert not np.any(gradient(smoky(), (ALBEDO, SUN))[:27])
 
 
 @pytest.mark.parametrize(("bsdf", "key", "skips"), [("null", DENSITY, True), ("null", FOG + "sigma_t.value.value", False)])

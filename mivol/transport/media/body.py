@@ -71,6 +71,7 @@ class Body:
         follows: whether each part, and the albedo (``follows_albedo``), is differentiated (:meth:`find_followed`).
         is_thick: whether collisions alone find the derivatives of the extinction (see the probes of free flights).
         has_low_albedo: whether some albedo may be too low for its derivatives to be found at collisions.
+        least_albedo: paths follow this albedo where the albedo is lower [1] (:mod:`mivol.transport.path.kept_collisions`).
     """
 
     def __init__(self, view: MediumView, box: Box | None, estimates_shadows: bool = False, hole: Box | None = None) -> None:
@@ -86,7 +87,7 @@ class Body:
         self.exact_parts = [p for p in view.parts if p.exact_line]
         self.flight_parts = flight_parts(view.parts)
         self.follows, self.follows_albedo = [True] * len(view.parts), True
-        self.is_thick, self.has_low_albedo = False, True
+        self.is_thick, self.has_low_albedo, self.least_albedo = False, True, 0.0
         self.gradients: list[Any] = []
         self.tangents: list[Any] = []
         self.has_tangent: list[bool] = []

@@ -12,13 +12,14 @@ Let A be the variance of stems and B of a branch, at the costs a and b. The vari
 k = sqrt(B a / (A b)), and b is proportional to the share of stems with a collision. The light behind a collision multiplies the
 derivative of the collision itself. Beside media with derivatives, a stem that collides in a medium without has one branch.
 
-A replay reads from memory what the first walk has found (:mod:`.kept_segments`).
+A replay reads from memory what the first walk has found (:mod:`.kept_segments`). Derivatives by albedos alone need no replay:
+the walk keeps its collisions (:mod:`.kept_collisions`).
 
 Only the device knows the number of branches, so that derivatives can be recorded and replayed. Branches have as many lanes as
 stems, of which the last are off.
 
 Bias: none. Memory: about 80 numbers a stem, 120 with probes (160 with surfaces); up to 40 numbers more for segments in passes
-of many rays (100 beside near light).
+of many rays (100 beside near light). Derivatives by albedos alone: up to ``MAX_KEPT_COLLISIONS`` in all.
 
 References: Arvo & Kirk 1990 (splitting); Vicini et al. 2021 (path replay).
 """
@@ -42,6 +43,7 @@ from mivol.transport.estimators.segment import KnownFlight, SegmentTransmittance
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays
+from mivol.transport.path.kept_collisions import KeptCollisions
 from mivol.transport.path.kept_segments import KeptSegments, SegmentNumber
 from mivol.transport.path.successive import walk_from_points
 from mivol.transport.path.walk import (
@@ -57,7 +59,14 @@ from mivol.transport.path.walk import (
 from mivol.transport.traversal.random_numbers import SpreadSampler
 from mivol.transport.traversal.rays import FineRay, point_along
 
-__all__ = ["carry_tangents", "count_branches", "prepare_derivatives", "replay_branches"]
+__all__ = [
+    "carry_tangents",
+    "collect_albedo_derivatives",
+    "count_branches",
+    "keeps_collisions",
+    "prepare_derivatives",
+    "replay_branches",
+]
 
 
 MAX_BRANCHES = 3
@@ -87,6 +96,12 @@ there."""
 
 MAX_SEGMENTS = 5
 """Largest number of segments of a stem or branch that are kept in memory for the replay."""
+
+MAX_KEPT_DEPTH = 256
+"""Largest path depth for which the collisions of a path are kept in memory."""
+
+MAX_KEPT_COLLISIONS = 1 << 22
+"""Collisions for which there is room in memory (160 MiB). More paths are walked in parts."""
 
 MAX_SORTED_LENGTH = 0xFFF
 """Largest number of scattering events told apart when branches are sorted by length."""
@@ -204,6 +219,46 @@ def _make_kept_segments(estimators: Estimators, count: int) -> KeptSegments:
     )
 
 
+def keeps_collisions(estimators: Estimators) -> bool:
+    """Whether :func:`collect_albedo_derivatives` serves a scene in which the albedos of media alone are followed.
+
+    All light must come from the ends of segments or be lit at collisions: near light and side flights scatter at points of
+    their own, and emission depends on the albedo.
+    """
+    media, depth = estimators.media, estimators.settings.depth_limit
+    has_own_points = estimators.near is not None or estimators.lobe is not None or estimators.start_kept_rays(1)
+    finds_albedos = not media.follows_extinction and not media.emits
+    return finds_albedos and not has_own_points and depth <= MAX_KEPT_DEPTH
+
+
+def collect_albedo_derivatives(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -> None:
+    """Add the derivatives of the radiance along camera rays by the albedos of media, from paths that are walked once.
+
+    Args:
+        estimators, rays, dL: as of :func:`replay_branches`, for :func:`keeps_collisions`.
+    """
+    first = rays.sampler.clone()
+    start = leave_camera_from_memory(estimators, rays.sampler, rays.ray)
+    n, most = dr.width(start.ray), max(1, estimators.settings.depth_limit - 1)
+    _, _, stems = walk_light(estimators, start, stops=True)
+    dr.schedule(dL)
+    branching = _Branching.of(estimators, stems, first)
+    parts = -(-n * most // MAX_KEPT_COLLISIONS)
+    paths = -(-n // parts)
+    kept, lane = KeptCollisions.empty(estimators.media, paths, most), dr.arange(mi.UInt32, paths)
+    for part in range(parts):
+        number = lane + dr.opaque(mi.UInt32, part * paths)
+        stem, branches = branching.gather(number)
+        L, end = kept.walk(estimators, branches.in_memory(), branching.count_from(part * paths, paths))
+        lengths = _Lengths.of((end - lane) // paths)
+        weight = dr.gather(mi.Spectrum, dL, stem) * branching.share_of(number)
+        dr.eval(lengths, weight)
+        order = lengths.sort()
+        kept.add_derivatives(order, *(dr.gather(type(values), values, order) for values in (end, L, weight)))
+        # The next part writes to the same memory.
+        dr.eval()
+
+
 def carry_tangents(estimators: Estimators, rays: CameraRays) -> mi.Spectrum:
     """The tangent of the radiance along camera rays, from the tangents of the parameters.
 
@@ -298,6 +353,11 @@ class _Branching:
         dr.eval(start, collided, several, place, count)
         return cls(start, collided, several, place, count, single, count_branches(estimators, n, count, single))
 
+    def count_from(self, first: int, most: int) -> mi.UInt32:
+        """Number of branches among ``most`` numbers from ``first`` on (an array of one number)."""
+        total = self.count * self.each + self.single
+        return dr.minimum(dr.maximum(total, first) - first, most)
+
     def share_of(self, number: mi.UInt32) -> mi.Float:
         """Share of the branches with these numbers in the light of their stems [1]."""
         return dr.select(number < self.count * self.each, dr.rcp(mi.Float(self.each)), 1)
@@ -305,9 +365,9 @@ class _Branching:
     def gather(self, number: mi.UInt32) -> tuple[mi.UInt32, PathStart]:
         """The stems and the starts of the branches with these numbers: the branches of a stem have consecutive numbers.
 
-        There is a lane for each stem, since a recording cannot depend on the number of branches; the last lanes are off.
+        A recording cannot depend on the number of branches, so there may be more lanes; the last lanes are off.
         """
-        n, ahead = dr.width(number), self.count * self.each
+        n, ahead = dr.width(self.collided), self.count * self.each
         is_one_of_several, beyond = number < ahead, number - ahead
         on = is_one_of_several | (beyond < self.single)
         stem = dr.gather(mi.UInt32, self.collided, dr.select(is_one_of_several, number // self.each, n - 1 - beyond), on)

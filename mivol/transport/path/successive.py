@@ -18,6 +18,7 @@ References: Novák et al. 2010 (path regeneration); Aila & Laine 2009 (threads t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -30,6 +31,7 @@ from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.walk import (
     Path,
     PathStart,
+    Score,
     advance_path,
     begin_path,
     film_alpha,
@@ -39,7 +41,7 @@ from mivol.transport.path.walk import (
 )
 from mivol.transport.traversal.random_numbers import SpreadSampler
 
-__all__ = ["paths_per_lane", "walk_branching", "walk_from_points", "walk_successively"]
+__all__ = ["paths_per_lane", "walk_branching", "walk_from_collisions", "walk_from_points", "walk_successively"]
 
 
 MIN_LANES = {"llvm": 1 << 13, "cuda": 1 << 20, "metal": 1 << 20}
@@ -50,7 +52,7 @@ BRANCHED_PATHS = 16
 """Paths for each lane, of those that may branch."""
 
 PATHS_FROM_POINTS = 16
-"""Starts of paths for each lane in :func:`walk_from_points`, left out or not."""
+"""Starts of paths for each lane in :func:`walk_from_points` and :func:`walk_from_collisions`, left out or not."""
 
 
 def paths_per_lane(limit: int, paths: int) -> int:
@@ -145,24 +147,85 @@ def walk_from_points(estimators: Estimators, starts: PathStart, front: mi.UInt32
     Bias, variance: as for :func:`mivol.transport.path.walk.walk_path`.
     """
     n = dr.width(starts.depth)
-    lanes, paths = -(-n // paths_per_lane(PATHS_FROM_POINTS, n)), _WorkList(front + back, dr.opaque(mi.UInt32, 0))
     L = dr.empty(mi.Spectrum, n)
-    dr.eval(starts, L)
+    dr.eval(L)
+
+    def begin(at: PathStart, index: mi.UInt32) -> Path:
+        path = start_path(estimators, at.ray, Primal(dr.zeros(mi.Spectrum, dr.width(index))), at.sampler, at.active)
+        path.depth = at.depth
+        return path
+
+    def end(path: Path, index: mi.UInt32, ended: mi.Bool) -> None:
+        dr.scatter(L, path.score.L, index, ended)
+
+    def place(number: mi.UInt32) -> mi.UInt32:
+        return dr.select(number < front, number, number + (n - front - back))
+
+    _walk_starts(estimators, starts, front + back, (place, begin, end), is_white=True)
+    dr.eval(L)
+    return L
+
+
+def walk_from_collisions(
+    estimators: Estimators,
+    starts: PathStart,
+    count: mi.UInt32,
+    begin: Callable[[PathStart, mi.UInt32], Score],
+    end: Callable[[Score, mi.UInt32, mi.Bool], None],
+) -> None:
+    """Walk paths from collisions with media, several in succession in each lane.
+
+    Args:
+        estimators: estimators of the render; their segments end in media.
+        starts: starts at collisions, in memory.
+        count: number of starts at the beginning of the arrays (an array of one number).
+        begin: makes the score of starts with an index.
+        end: called with the scores of paths, the indices of their starts, and the lanes in which paths end.
+
+    Bias, variance: as for :func:`mivol.transport.path.walk.walk_path`.
+    """
+
+    def start(at: PathStart, index: mi.UInt32) -> Path:
+        # A path does not fly before its first event.
+        return begin_path(estimators, replace(at, flight=None), begin(at, index))
+
+    steps = mi.UInt32, start, lambda path, index, ended: end(path.score, index, ended)
+    _walk_starts(estimators, starts, count, steps)
+
+
+def _walk_starts(
+    estimators: Estimators,
+    starts: PathStart,
+    count: mi.UInt32,
+    steps: tuple[Callable, Callable, Callable],
+    is_white: bool = False,
+) -> None:
+    """Walk paths from collisions in succession.
+
+    Args:
+        estimators, starts: as of :func:`walk_from_collisions`.
+        count: number of paths to walk (an array of one number).
+        steps: the index of the start of a path by its number; a path by its start and this index; and what is done with paths,
+            indices and the lanes in which paths end.
+        is_white: the first collision has an albedo of 1.
+    """
+    n, (place, begin, end) = dr.width(starts.depth), steps
+    lanes, paths = -(-n // paths_per_lane(PATHS_FROM_POINTS, n)), _WorkList(count, dr.opaque(mi.UInt32, 0))
+    dr.eval(starts)
 
     def start(index: mi.UInt32, active: mi.Bool) -> tuple[Path, KnownFlight]:
         at = starts.gather(index, active)
-        path = start_path(estimators, at.ray, Primal(dr.zeros(mi.Spectrum, lanes)), at.sampler, active)
-        path.depth = at.depth
-        return path, at.flight
+        return begin(at, index), at.flight
 
     def advance(path: Path, begun: KnownFlight, index: mi.UInt32, on: mi.Bool) -> tuple:
         hit = make_collision(estimators.media, path.ray, begun.t, begun.body, path.active & begun.on)
-        hit.albedo = dr.full(mi.Spectrum, 1, lanes)
+        if is_white:
+            hit.albedo = dr.full(mi.Spectrum, 1, lanes)
         path, begun = advance_path(estimators, path, hit), begun.forget()
         asks = on & ~path.active
-        dr.scatter(L, path.score.L, index, asks & (index != NONE_YET))
+        end(path, index, asks & (index != NONE_YET))
         number, begins = paths.take(asks)
-        index = dr.select(asks, dr.select(number < front, number, number + (n - front - back)), index)
+        index = dr.select(asks, place(number), index)
         fresh, at_point = start(index, begins)
         return dr.select(asks, fresh, path), dr.select(asks, at_point, begun), index, path.active | begins
 
@@ -170,8 +233,6 @@ def walk_from_points(estimators: Estimators, starts: PathStart, front: mi.UInt32
     index, on = dr.full(mi.UInt32, NONE_YET, lanes), dr.full(mi.Bool, True, lanes)
     state = (*start(index, ~on), index, on)
     dr.while_loop(state=state, cond=lambda *state: state[-1], body=advance, label="paths from points")
-    dr.eval(L)
-    return L
 
 
 def walk_branching(

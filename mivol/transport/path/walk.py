@@ -57,6 +57,7 @@ from mivol.transport.traversal.rays import FineRay, Ray, clip_camera_ray, point_
 __all__ = [
     "Path",
     "PathStart",
+    "Score",
     "add_probes",
     "advance_path",
     "begin_path",

@@ -48,6 +48,7 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.rays import FineRay, Ray
 
 __all__ = [
+    "MIN_ALBEDO",
     "FlightSegment",
     "Probe",
     "ProbeTerm",

@@ -384,9 +384,10 @@ def make_collision(media: SceneMedia, ray: Ray, t: mi.Float64, body: mi.UInt32, 
 def _scattering_albedo(
     media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, mei: mi.MediumInteraction3f, on: mi.Bool
 ) -> mi.Spectrum:
-    """sigma_s / sigma_t at a point of a medium [1]."""
+    """sigma_s / sigma_t at a point of a medium [1], at least ``body.least_albedo``."""
     if body.view.albedo is not None:
-        return dr.detach(eval_albedo(body, mei, on))
+        albedo = dr.detach(eval_albedo(body, mei, on))
+        return dr.maximum(albedo, body.least_albedo) if body.least_albedo > 0 else albedo
     sigma_s, sigma_t = (_eval_extinction(media, body, ray, t, on, name) for name in ("sigma_s", "sigma_"))
     return dr.select(sigma_t > 0, sigma_s / dr.select(sigma_t > 0, sigma_t, 1), 0)
 
