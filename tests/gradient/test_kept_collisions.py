@@ -94,7 +94,8 @@ def along_albedo(scene: mi.Scene, v: np.ndarray, beside: str | None = None) -> E
             followed[key] = params[key] = type(params[key])(dr.detach(params[key]))
             dr.enable_grad(params[key])
         params.update()
-        integrator.render_backward(scene, params, mi.TensorXf(WEIGHT.astype(np.float32)), seed=fresh(k + 100 * bool(beside)), spp=256)
+        seed = fresh(k + 100 * bool(beside))
+        integrator.render_backward(scene, params, mi.TensorXf(WEIGHT.astype(np.float32)), seed=seed, spp=256)
         found.append(np.sum(np.array(dr.grad(params[ALBEDO]), np.float64) * v))
         for key in followed:
             dr.disable_grad(params[key])
