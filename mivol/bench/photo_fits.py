@@ -40,7 +40,7 @@ from mivol.validate.metrics import ImageScore, average_scores, score_image
 
 __all__ = [
     "FittedProblem",
-    "PhotoFit",
+    "TimedFit",
     "PhotoProblem",
     "PhotoSize",
     "find_data",
@@ -209,7 +209,7 @@ def prepare_fit_in_time(folder: Path, photos: dict, field: dict, seconds: float,
 
 
 @dataclass(frozen=True)
-class PhotoFit:
+class TimedFit:
     """A finished fit and its cost.
 
     Attributes:
@@ -231,7 +231,7 @@ class PhotoFit:
         return reference_seconds(self.processor, self.rate)
 
 
-def fit_photographs(problem: FittedProblem, walk_side: int) -> PhotoFit:
+def fit_photographs(problem: FittedProblem, walk_side: int) -> TimedFit:
     """Take all steps of a fit, and measure them.
 
     Args:
@@ -247,4 +247,4 @@ def fit_photographs(problem: FittedProblem, walk_side: int) -> PhotoFit:
         fit.complete()
     held = dr.detail.malloc_watermark(dr.backend_v(mi.Float)) - before
     rates.append(measure_walk_rate(walk_side))
-    return PhotoFit(fit, watch.processor, float(np.mean(rates)), held)
+    return TimedFit(fit, watch.processor, float(np.mean(rates)), held)

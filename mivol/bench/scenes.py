@@ -38,7 +38,7 @@ __all__ = [
     "REFERENCE_RATE",
     "TO_WORLD",
     "TUTORIAL_SCALE",
-    "Extinction",
+    "StudyExtinction",
     "GridRays",
     "ParameterGradient",
     "as_dense_as_smoke",
@@ -79,7 +79,7 @@ TUTORIAL_SCALE = 40.0
 """Factor on the smoke in the tutorial; optical depths reach 65."""
 
 
-class Extinction(NamedTuple):
+class StudyExtinction(NamedTuple):
     """An extinction (Z, Y, X) float32 [1/length] and its origin."""
 
     values: np.ndarray
@@ -89,36 +89,38 @@ class Extinction(NamedTuple):
         return f"{'x'.join(map(str, self.values.shape[::-1]))}, {self.origin}"
 
 
-def smoke() -> Extinction:
+def smoke() -> StudyExtinction:
     """The smoke of the tutorial at its density, or made-up smoke of the same size."""
     path = DATA / "volumes_vol" / "tutorials_volume.vol"
     if path.is_file():
-        return Extinction(np.float32(TUTORIAL_SCALE) * read_volume(path, frame="unit").values[..., 0], "Mitsuba tutorial, x 40")
+        return StudyExtinction(
+            np.float32(TUTORIAL_SCALE) * read_volume(path, frame="unit").values[..., 0], "Mitsuba tutorial, x 40"
+        )
     return made_up((53, 45, 44), peak=1.85 * TUTORIAL_SCALE)
 
 
-def fine_smoke(res: int) -> Extinction:
+def fine_smoke(res: int) -> StudyExtinction:
     """The smoke upsampled to res^3 voxels."""
     coarse = smoke()
     fine = upsample(mi.TensorXf(np.ascontiguousarray(coarse.values[..., None])), (res,) * 3)
-    return Extinction(np.array(fine)[..., 0], f"{coarse.origin}, upsampled")
+    return StudyExtinction(np.array(fine)[..., 0], f"{coarse.origin}, upsampled")
 
 
-def made_up(shape: tuple[int, int, int], peak: float, why: str = "no data folder") -> Extinction:
+def made_up(shape: tuple[int, int, int], peak: float, why: str = "no data folder") -> StudyExtinction:
     """Made-up soft blobs and filaments (Z, Y, X) with the seed 0; ``why`` is the reason in their origin."""
-    return Extinction(make_procedural("tangle", shape, 0, peak)[..., 0], f"procedural ({why})")
+    return StudyExtinction(make_procedural("tangle", shape, 0, peak)[..., 0], f"procedural ({why})")
 
 
-def ct_scan(res: int) -> Extinction:
+def ct_scan(res: int) -> StudyExtinction:
     """The CT scan of a bonsai at 256^3 voxels, 0 to 2 [1/length]; a made-up volume at another resolution."""
     path = DATA / "ct_mri" / "bonsai.vti"
     if res == 256 and path.is_file():
         values = read_volume(path, frame="unit").values[..., 0]
-        return Extinction(values * np.float32(2 / values.max()), "bonsai CT")
+        return StudyExtinction(values * np.float32(2 / values.max()), "bonsai CT")
     return made_up((res,) * 3, 2.0, "no data folder" if res == 256 else "quick")
 
 
-def threads_in_space(res: int) -> Extinction:
+def threads_in_space(res: int) -> StudyExtinction:
     """Thin curved threads in 1 % of res^3 voxels; all other voxels are exactly 0."""
     rng = np.random.default_rng(0)
     values = np.zeros((res,) * 3, np.float32)
@@ -131,27 +133,27 @@ def threads_in_space(res: int) -> Extinction:
         curve = 0.5 + a * np.cos(s) + b * np.sin(s) + c * np.cos(2 * s) / 2
         nodes = np.clip(np.rint(curve * res).astype(int)[:, None] + offsets, 0, res - 1)
         np.maximum.at(values, tuple(nodes.reshape(-1, 3).T), np.tile(stamp, len(curve)))
-    return Extinction(20 * values, f"made-up threads, {np.count_nonzero(values) / values.size:.1%} of the voxels not 0")
+    return StudyExtinction(20 * values, f"made-up threads, {np.count_nonzero(values) / values.size:.1%} of the voxels not 0")
 
 
-def les_cloud() -> Extinction:
+def les_cloud() -> StudyExtinction:
     """A cloud of a large-eddy simulation, stretched to the box; its optical depth along the vertical stays the same."""
     path = DATA / "clouds_les" / "rico32x37x26.txt"
     if not path.is_file():
         return made_up((26, 37, 32), TUTORIAL_SCALE)
     cloud = read_volume(path)
     height = np.linalg.norm(cloud.to_world[:3, 2])
-    return Extinction(cloud.values[..., 0] * np.float32(height / 2), "LES cloud (RICO), stretched to a cube")
+    return StudyExtinction(cloud.values[..., 0] * np.float32(height / 2), "LES cloud (RICO), stretched to a cube")
 
 
-def as_dense_as_smoke(volume: Extinction) -> Extinction:
+def as_dense_as_smoke(volume: StudyExtinction) -> StudyExtinction:
     """Scale a volume to the largest extinction of the smoke, and empty its outermost voxels.
 
     Mitsuba continues rays (1 + |p|) 9e-5 behind a boundary. A medium that touches the boundary loses this skin, which holds 2 %
     of the light at such an extinction (measured by quadrature in float64, which agrees with mivol).
     """
     values = np.pad(volume.values[1:-1, 1:-1, 1:-1], 1)
-    return Extinction(values * np.float32(smoke().values.max() / values.max()), f"{volume.origin}, as dense as the smoke")
+    return StudyExtinction(values * np.float32(smoke().values.max() / values.max()), f"{volume.origin}, as dense as the smoke")
 
 
 # -- Scenes ------------------------------------------------------------------------------------------------------------

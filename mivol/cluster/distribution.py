@@ -31,7 +31,7 @@ from mivol.experiments.scene_fit import SceneFit, make_integrator
 from mivol.files.fetch import PREFIX, resolve_path
 from mivol.optim.problem import Part, Problem, Reals, add_parts, to_arrays, to_tensors
 from mivol.optim.scenes.render_noise import RenderLoss, ViewLoss
-from mivol.optim.scenes.scene_problem import Linearization, SceneProblem, draw_views
+from mivol.optim.scenes.scene_problem import SceneLinearization, SceneProblem, draw_views
 from mivol.optim.scenes.views import ADJOINT, PRIMAL, RenderBatch, View, count_pixels, make_batches, make_single_batches
 from mivol.report.record import Table
 from mivol.validate.reference import Complete
@@ -172,7 +172,7 @@ class SharedSceneProblem(SceneProblem):
         return math.fsum(losses)
 
 
-class SharedLinearization(Linearization):
+class SharedLinearization(SceneLinearization):
     """A scene's problem around one point u, with images differentiated by workers."""
 
     problem: SharedSceneProblem

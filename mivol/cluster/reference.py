@@ -36,7 +36,7 @@ AHEAD = 4
 
 Show = Callable[[str], None]
 
-Page = Callable[[list[SweepRow], bool], None]
+ShowRows = Callable[[list[SweepRow], bool], None]
 """Receives the views, and whether some are under way."""
 
 
@@ -99,7 +99,9 @@ class _View:
             self.reference.add(*batch)
 
 
-def complete_on(pool: Pool, scene: str, show: Show = lambda line: None, page: Page = lambda rows, is_running: None) -> Complete:
+def complete_on(
+    pool: Pool, scene: str, show: Show = lambda line: None, page: ShowRows = lambda rows, is_running: None
+) -> Complete:
     """Return the function that renders prepared references on workers.
 
     Args:
@@ -112,7 +114,7 @@ def complete_on(pool: Pool, scene: str, show: Show = lambda line: None, page: Pa
 
 
 def _complete(
-    pool: Pool, scene: str, show: Show, page: Page, prepared: Iterator[PreparedReference]
+    pool: Pool, scene: str, show: Show, page: ShowRows, prepared: Iterator[PreparedReference]
 ) -> Iterator[ReferenceResult]:
     queue = _Queue(pool, scene, iter(prepared))
     try:

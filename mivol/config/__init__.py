@@ -39,11 +39,11 @@ from mivol.config.scans import (
     Nikon,
     OfData,
     Parallel,
-    Readings,
+    ReadingSettings,
     ScanExperiment,
     SolveSettings,
     Stack,
-    Table,
+    ViewTable,
     is_circle,
 )
 from mivol.config.scenes import Files, Rendered, SceneExperiment, Sought, Truth
@@ -54,8 +54,8 @@ from mivol.schema import AUTO, Section, check_keys, explain_error
 __all__ = [
     "AUTO", "CAPTURE", "Cone", "Detector", "EXPERIMENTS", "Ellipsoids", "Experiment", "FIELD_KINDS", "FieldExperiment",
     "Files", "GaussianExperiment", "HashExperiment", "KINDS", "Known", "MODELS", "Matrices", "Measured", "NOT_RESULT",
-    "NerfExperiment", "Nikon", "OctreeExperiment", "OctreeSettings", "OfData", "Parallel", "PhotoExperiment", "Readings",
-    "Rendered", "ScanExperiment", "SceneExperiment", "Section", "ShowSettings", "SolveSettings", "Sought", "Stack", "Table",
+    "NerfExperiment", "Nikon", "OctreeExperiment", "OctreeSettings", "OfData", "Parallel", "PhotoExperiment", "ReadingSettings",
+    "Rendered", "ScanExperiment", "SceneExperiment", "Section", "ShowSettings", "SolveSettings", "Sought", "Stack", "ViewTable",
     "Truth", "apply_change", "flatten_settings", "from_dict", "is_circle", "load", "of_photographs", "resolved",
 ]  # fmt: skip
 

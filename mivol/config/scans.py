@@ -72,7 +72,7 @@ def is_circle(scan: object) -> bool:
     return isinstance(scan, Parallel) or (isinstance(scan, Cone) and not scan.lift and not scan.sources)
 
 
-class Table(Section, kw_only=True, tag_field="beam", tag="table"):
+class ViewTable(Section, kw_only=True, tag_field="beam", tag="table"):
     """A point source and a flat detector on any trajectory; measured data bring the detector's size."""
 
     file: Annotated[str, setting("path", "12 lengths per view: source, detector's middle, steps to next column and row")]
@@ -116,7 +116,7 @@ class Known(Simulated, kw_only=True, tag_field="source", tag="volume"):
     scale: Annotated[float, setting("1/length", "factor on the volume's values", gt=0)] = 1.0
 
 
-class Phase(Section, kw_only=True):
+class PhaseFilter(Section, kw_only=True):
     """Paganin's filter of a single material."""
 
     delta_beta: Annotated[float, setting("1", "delta / beta of the material: decrement over absorption index", gt=0)]
@@ -125,7 +125,7 @@ class Phase(Section, kw_only=True):
     pixel: Annotated[float, setting("um", "edge of a pixel at the object", gt=0)]
 
 
-class Readings(Section):
+class ReadingSettings(Section):
     """Settings of all measured projections."""
 
     find_axis: Annotated[
@@ -161,7 +161,7 @@ class Readings(Section):
     zingers: Annotated[
         float, setting("1", "pixels this many deviations brighter or darker than their neighbours are not used; 0: off", ge=0)
     ] = 0.0
-    phase: Annotated[Phase | None, setting("1", "Paganin's filter, for a single material near the detector")] = None
+    phase: Annotated[PhaseFilter | None, setting("1", "Paganin's filter, for a single material near the detector")] = None
     hardening: Annotated[
         int, setting("1", "degree of the polynomial that corrects beam hardening in a single material; 0: off", ge=0, le=5)
     ] = 0
@@ -200,7 +200,7 @@ class Readings(Section):
 FirstRow = Annotated[Literal["lowest", "highest"], setting("1", "which row of the detector comes first in the file")]
 
 
-class Measured(Readings, kw_only=True, tag_field="source", tag="measured"):
+class Measured(ReadingSettings, kw_only=True, tag_field="source", tag="measured"):
     """An HDF5 file with flat and dark fields: NXtomo (NeXus), Data Exchange, or datasets by name."""
 
     file: Annotated[str, setting("path", "HDF5 file of any suffix", min_length=1)]
@@ -225,7 +225,7 @@ class Measured(Readings, kw_only=True, tag_field="source", tag="measured"):
     first_row: FirstRow = "lowest"
 
 
-class Stack(Readings, kw_only=True, tag_field="source", tag="stack"):
+class Stack(ReadingSettings, kw_only=True, tag_field="source", tag="stack"):
     """Projections as images or arrays, with flat and dark fields in other files."""
 
     file: Annotated[
@@ -265,7 +265,7 @@ class Stack(Readings, kw_only=True, tag_field="source", tag="stack"):
             raise ValueError("only readings of an intensity saturate: leave saturation out, or change reading")
 
 
-class Nikon(Readings, kw_only=True, tag_field="source", tag="nikon"):
+class Nikon(ReadingSettings, kw_only=True, tag_field="source", tag="nikon"):
     """A scan of a Nikon (X-Tek) laboratory scanner [mm]: a settings file, and TIFF files beside the settings."""
 
     file: Annotated[str, setting("path", ".xtekct: geometry, white level and default grid", min_length=1)]
@@ -350,7 +350,7 @@ class ScanExperiment(Section):
     """A reconstruction from projections: a file with a table ``[scan]``."""
 
     title: Title
-    scan: Annotated[Parallel | Cone | Table | Matrices | OfData, setting("1", "beam and detector")]
+    scan: Annotated[Parallel | Cone | ViewTable | Matrices | OfData, setting("1", "beam and detector")]
     data: Annotated[Ellipsoids | Known | Measured | Stack | Nikon, setting("1", "the projections")]
     grid: Annotated[
         Grid | None, setting("1", "the voxels; absent: those of a Nikon file, or a voxel a pixel of measured circular scans")

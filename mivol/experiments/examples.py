@@ -38,7 +38,7 @@ NEIGHBOUR = re.compile(r"\.\./demo/([\w.]+)")
 
 
 @dataclass(frozen=True)
-class StandIn:
+class ProceduralData:
     """A procedural volume in place of public data.
 
     Attributes:
@@ -110,7 +110,7 @@ class Example:
     """
 
     says: str
-    stand_in: StandIn | ComputedScan | None = None
+    stand_in: ProceduralData | ComputedScan | None = None
     photographs: str = ""
     scan: str = ""
     folder: str = ""
@@ -121,8 +121,8 @@ class Example:
         return examples_folder() / (self.folder or name)
 
 
-def _smoke_stand_in(setting: str) -> StandIn:
-    return StandIn("smoke", setting, (53, 45, 44), 1.8)
+def _smoke_stand_in(setting: str) -> ProceduralData:
+    return ProceduralData("smoke", setting, (53, 45, 44), 1.8)
 
 
 _SLICES = ComputedScan(
@@ -155,7 +155,7 @@ EXAMPLES: dict[str, Example] = {
     "white_smoke": Example("a smoke that scatters, under a white sky", _smoke_stand_in("truth.file")),
     "lamp": Example("where is the lamp behind a known smoke?", _smoke_stand_in("scene.define.volume")),
     "tooth": Example("a tooth from synchrotron projections", _SLICES),
-    "cloud": Example("a cloud under sun and sky", StandIn("cloud", "truth.file", (26, 37, 32), 0.12)),
+    "cloud": Example("a cloud under sun and sky", ProceduralData("cloud", "truth.file", (26, 37, 32), 0.12)),
 }
 
 

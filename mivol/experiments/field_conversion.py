@@ -34,7 +34,7 @@ from mivol.fields.sampled_field import SampledField
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files.source import check_file, select_by_suffix
 from mivol.optim.loop import begin_fit
-from mivol.optim.photographs.field_view import CameraRays, prepare_view, render_view
+from mivol.optim.photographs.field_view import PixelRays, prepare_view, render_view
 from mivol.optim.photographs.octree_building import (
     OctreeRecipe,
     ViewRays,
@@ -70,11 +70,11 @@ FITTED_VIEWS, FITTED_EDGE = 60, 160
 NETWORK_PRESETS = {"hash": "minute", "nerf": "minutes"}
 """Presets of the fits, by the kind of the target."""
 
-Field = SphericalGrid | Octree | SampledField
+ConvertibleField = SphericalGrid | Octree | SampledField
 
 
 @dataclass(frozen=True)
-class Source:
+class Representation:
     """What is converted, or what it became.
 
     Attributes:
@@ -83,12 +83,12 @@ class Source:
         view: from which the file is shown.
     """
 
-    model: Field | Gaussians
+    model: ConvertibleField | Gaussians
     boxes: list[np.ndarray]
     view: HomeView | None
 
     @classmethod
-    def open(cls, path: Path) -> Source:
+    def open(cls, path: Path) -> Representation:
         """Read a field (.npz), or Gaussians or points of another file.
 
         Raises:
@@ -100,7 +100,7 @@ class Source:
         return cls.from_field(read_field(check_file(path)), read_field_view(path))
 
     @classmethod
-    def from_field(cls, field: Field, view: HomeView | None = None) -> Source:
+    def from_field(cls, field: ConvertibleField, view: HomeView | None = None) -> Representation:
         """A field as a source."""
         boxes = [field.level_to_world(k) for k in range(field.levels)] if isinstance(field, SphericalGrid) else [field.to_world]
         return cls(field, boxes, view)
@@ -124,16 +124,16 @@ class Source:
         return [camera for box in self.boxes for camera in cameras_around(box, edge, max(views // len(self.boxes), 1))]
 
 
-def describe_loss(path: Path, source: Source, target: Path) -> str:
+def describe_loss(path: Path, source: Representation, target: Path) -> str:
     """PSNR between views of a file and its source; colours of radiance are compared with colours of radiance only."""
-    written = Source.open(target)  # as it will be read: rounded values
+    written = Representation.open(target)  # as it will be read: rounded values
     if isinstance(written.model, Gaussians) and not isinstance(source.model, Gaussians) and source.model.space == "linear":
         return "their colours are code values of the field's radiance, so views of the two do not compare"
     loss = views_psnr(written, source)
     return f"{loss:.1f} dB between views of {target.name} and {path.name}: {VIEWED}, over black, peak 1"
 
 
-def views_psnr(one: Source, other: Source) -> float:
+def views_psnr(one: Representation, other: Representation) -> float:
     """PSNR between views [dB], of the innermost box of ``other``, over black, peak 1."""
     cameras = cameras_around(other.boxes[0], EDGE)
     images, truth = (np.stack([source.show(camera)[0] for camera in cameras]) for source in (one, other))
@@ -167,7 +167,7 @@ def convert_to_octree(path: Path, target: Path, resolution: int | None, variant:
             :func:`mivol.optim.photographs.octree_building.build_octree` and the disk.
     """
     set_variant(variant)
-    source = Source.open(path)
+    source = Representation.open(path)
     if resolution is not None:
         if isinstance(source.model, Octree):
             raise MivolError(f"{path} is an octree, whose leaves stay as they are: leave out --resolution.")
@@ -182,7 +182,7 @@ def convert_to_octree(path: Path, target: Path, resolution: int | None, variant:
     return "\n".join(lines)
 
 
-def make_octree(source: Source, recipe: OctreeRecipe) -> Octree:
+def make_octree(source: Representation, recipe: OctreeRecipe) -> Octree:
     """The octree of any source."""
     model = source.model
     if isinstance(model, Octree):
@@ -195,13 +195,13 @@ def make_octree(source: Source, recipe: OctreeRecipe) -> Octree:
     return (build_octree_of_levels if source.is_nested else build_octree)(model, rays, recipe)
 
 
-def look_around(source: Source, edge: int) -> ViewRays:
+def look_around(source: Representation, edge: int) -> ViewRays:
     """Rays from all sides of the boxes of a source, view by view."""
     cameras = source.cameras(edge, LEAF_VIEWS)
 
     def rays() -> Iterator[RayBundle]:
         for camera in cameras:
-            view = CameraRays.from_camera(camera)
+            view = PixelRays.from_camera(camera)
             yield view.make(0, view.count)[1]
 
     return rays
@@ -221,7 +221,7 @@ def convert_to_grid(path: Path, target: Path, resolution: int | None, variant: s
         MivolError: a source that is a grid, a resolution for an octree, too many nodes, or as the readers and the disk.
     """
     set_variant(variant)
-    source = Source.open(path)
+    source = Representation.open(path)
     if isinstance(source.model, SphericalGrid) and not source.is_nested:
         raise MivolError(f"{path} is a grid of one box already: use it as it is, or make it an octree, a hash grid or a NeRF.")
     if resolution is not None and isinstance(source.model, Octree):
@@ -249,18 +249,18 @@ def convert_to_nested(path: Path, target: Path, resolution: int | None, box: Seq
         MivolError: as :func:`mivol.fields.gaussian_grid.gaussians_to_nested`, the readers and the disk.
     """
     set_variant(variant)
-    source = Source.open(path)
+    source = Representation.open(path)
     low, high = np.quantile(source.model.means, [0.25, 0.75], axis=0) if box is None else np.reshape(box, (2, 3))
     grid = gaussians_to_nested(source.model, low, high, resolution or NESTED_NODES)
     write_field(target, grid, view=source.view)
-    loss = views_psnr(source, Source.open(target))
+    loss = views_psnr(source, Representation.open(target))
     between = (
         f"{loss:.1f} dB between views of the innermost box, in {target.name} and {path.name}: {VIEWED}, over black, peak 1"
     )
     return f"{target}: {grid.levels} nested boxes of {describe_nodes(grid)}\n{between}"
 
 
-def make_grid(source: Source, resolution: int | None = None) -> SphericalGrid:
+def make_grid(source: Representation, resolution: int | None = None) -> SphericalGrid:
     """The grid of any source: a grid of one box unchanged, other sources by :func:`convert_to_grid`.
 
     Raises:
@@ -286,7 +286,7 @@ def grid_of_network(field: SampledField) -> tuple[SphericalGrid, str]:
         MivolError: no matter in the box.
     """
     grid = sample_to_grid(field, GRID_NODES)
-    loss = views_psnr(Source.from_field(grid), Source.from_field(field))
+    loss = views_psnr(Representation.from_field(grid), Representation.from_field(field))
     between = f"{loss:.1f} dB between views of the grid and of the {field.noun}: {VIEWED}, over black, peak 1"
     return grid, f"{describe_nodes(grid)}\n{between}"
 
@@ -312,7 +312,7 @@ def convert_to_gaussians(path: Path, target: Path, resolution: int | None, varia
     """
     select_by_suffix(target, GAUSSIAN_WRITERS)
     set_variant(variant)
-    source = Source.open(path)
+    source = Representation.open(path)
     if source.is_nested:
         made = nested_to_gaussians(source.model, resolution)
     else:
@@ -342,7 +342,7 @@ def convert_to_network(path: Path, target: Path, kind: str, variant: str, plan: 
     """
     set_variant(variant)
     plan = plan or PRESETS[kind][NETWORK_PRESETS[kind]]
-    source = Source.open(path)
+    source = Representation.open(path)
     if not isinstance(source.model, Gaussians) and source.model.space == "linear":
         raise MivolError(f"{path} has colours of radiance, and views of code values are fitted: fit the photographs instead.")
     cameras = source.cameras(FITTED_EDGE, FITTED_VIEWS)
@@ -354,7 +354,7 @@ def convert_to_network(path: Path, target: Path, kind: str, variant: str, plan: 
     return "\n".join([f"{target}: {fitted}", describe_loss(path, source, target), describe_sizes(path, target)])
 
 
-def take_view(source: Source, camera: Camera, number: int) -> Photo:
+def take_view(source: Representation, camera: Camera, number: int) -> Photo:
     """A view as a photograph with alpha, in front of black."""
     image, opacity = source.show(camera)
     alpha = np.clip(opacity, 0, 1).astype(np.float32)
@@ -378,7 +378,7 @@ def compare_speed(field: SphericalGrid | Octree, other: SphericalGrid | Octree) 
         The two rates [pixel/s], and the median of the ratios of all turns, first over second.
     """
     cameras = cameras_around(other.to_world, TIMED_EDGE)
-    views = [CameraRays.from_camera(camera) for camera in cameras]
+    views = [PixelRays.from_camera(camera) for camera in cameras]
     renders = [[prepare_view(one, camera, stop=1e-3) for camera in cameras] for one in (field, other)]
     seconds, threads = np.empty((TURNS + 1, 2)), dr.thread_count()
     set_thread_count(1)

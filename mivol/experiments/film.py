@@ -133,7 +133,7 @@ def _small(camera: Camera) -> Camera:
 # -- Files of films --------------------------------------------------------------------------------------------------------
 
 
-Frames = Iterator[NDArray[np.uint8]]
+FilmFrames = Iterator[NDArray[np.uint8]]
 
 QUALITY = "18"
 """Constant rate factor of H.264: 0 is lossless, 18 looks lossless."""
@@ -175,7 +175,7 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], *, fps: f
     return path
 
 
-def _check_frames(frames: Iterable[NDArray]) -> Frames:
+def _check_frames(frames: Iterable[NDArray]) -> FilmFrames:
     shape = None
     for number, frame in enumerate(frames):
         frame = np.asarray(frame)
@@ -189,7 +189,7 @@ def _check_frames(frames: Iterable[NDArray]) -> Frames:
         raise MivolError("a film needs at least one frame; none was given.")
 
 
-def _write_mp4(path: Path, frames: Frames, fps: float) -> None:
+def _write_mp4(path: Path, frames: FilmFrames, fps: float) -> None:
     try:
         import imageio_ffmpeg
     except ImportError:
@@ -222,12 +222,12 @@ def _pad_to_even(frame: NDArray) -> NDArray:
     return np.ascontiguousarray(np.pad(frame, ((0, rows), (0, columns), (0, 0)), mode="edge"))
 
 
-def _write_gif(path: Path, frames: Frames, fps: float) -> None:
+def _write_gif(path: Path, frames: FilmFrames, fps: float) -> None:
     images = (PIL.Image.fromarray(frame) for frame in frames)
     _save_animation(path, next(images), images, fps, "GIF")
 
 
-def _write_webp(path: Path, frames: Frames, fps: float) -> None:
+def _write_webp(path: Path, frames: FilmFrames, fps: float) -> None:
     """Pillow takes all frames of a .webp at once. They wait in a file, which Pillow reads in place."""
     with TemporaryFile(dir=path.parent) as stored:
         first = next(frames)
@@ -246,7 +246,7 @@ def _save_animation(
 
 
 #: suffix -> writer.
-FILM_WRITERS: dict[str, Callable[[Path, Frames, float], None]] = {
+FILM_WRITERS: dict[str, Callable[[Path, FilmFrames, float], None]] = {
     ".mp4": _write_mp4,
     ".webp": _write_webp,
     ".gif": _write_gif,

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mivol import config
-from mivol.config import Cone, Ellipsoids, Known, Matrices, Nikon, OfData, Readings, Table, is_circle
+from mivol.config import Cone, Ellipsoids, Known, Matrices, Nikon, OfData, ReadingSettings, ViewTable, is_circle
 from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.experiments.readings import ScanReadings, even_angles, nikon_grid, note_order, note_rows, read_scan
@@ -86,7 +86,7 @@ def describe_beam(settings: config.ScanExperiment) -> str:
 def make_geometry(settings: config.ScanExperiment, base: Path) -> FlatDetector:
     """Return beam and detector of computed projections."""
     scan = settings.scan
-    if isinstance(scan, Table | Matrices):
+    if isinstance(scan, ViewTable | Matrices):
         return make_beam(settings, base, np.arange(0), scan.detector)
     angles = even_angles(scan, scan.views * max(1, len(getattr(scan, "sources", ()))))
     return make_beam(settings, base, angles, scan.detector)
@@ -95,7 +95,7 @@ def make_geometry(settings: config.ScanExperiment, base: Path) -> FlatDetector:
 def make_beam(settings: config.ScanExperiment, base: Path, angles: np.ndarray, detector: tuple[int, int]) -> FlatDetector:
     """Return the beam of the settings, with these angles [rad] and pixels."""
     scan = settings.scan
-    if isinstance(scan, Table):
+    if isinstance(scan, ViewTable):
         return PanelViews(read_columns(base / scan.file, COLUMNS), detector)
     if isinstance(scan, Matrices):
         matrices = read_columns(base / scan.file, COLUMNS).reshape(-1, 3, 4)
@@ -138,7 +138,7 @@ def make_data(settings: config.ScanExperiment, base: Path, grid: VoxelGrid) -> P
     Raises:
         MivolError: unreadable files, files of different sizes, rays that all miss the grid, or more rays than memory.
     """
-    if isinstance(settings.data, Readings):
+    if isinstance(settings.data, ReadingSettings):
         return check_data(settings, read_measured(settings, base), grid)
     check_rays(settings)
     geometry = make_geometry(settings, base)
@@ -327,7 +327,7 @@ def check_light(transmission: Transmission) -> None:
 
 
 def correct_pixels(
-    data: config.Readings, transmission: Transmission
+    data: config.ReadingSettings, transmission: Transmission
 ) -> tuple[Transmission, list[str], list[tuple[str, np.ndarray, np.ndarray]]]:
     """Leave out zingers and remove phase contrast, if the settings ask for it; notes and pictures say so.
 
@@ -381,7 +381,7 @@ def show_axis(beam: ParallelBeam | ConeBeam, y: np.ndarray) -> list[tuple[str, n
     return [("axis", *(np.concatenate([row, mirror(column)]) for column in (middle, found)))]
 
 
-def correct_rings(y: np.ndarray, weights: np.ndarray, data: config.Readings) -> tuple[np.ndarray, list[str]]:
+def correct_rings(y: np.ndarray, weights: np.ndarray, data: config.ReadingSettings) -> tuple[np.ndarray, list[str]]:
     """Remove rings if the settings ask for it, and say so.
 
     Args:
@@ -452,7 +452,7 @@ def _describe_doubtful_air(air: Air) -> str:
 
 
 def resolve_axis(
-    data: config.Readings, beam: ParallelBeam | ConeBeam, y: np.ndarray, weights: np.ndarray
+    data: config.ReadingSettings, beam: ParallelBeam | ConeBeam, y: np.ndarray, weights: np.ndarray
 ) -> tuple[float | None, list[str]]:
     """Return the found ``axis_offset`` of a circular scan [length] or None, and notes.
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from mivol import config
-from mivol.config import Detector, Matrices, Measured, Nikon, Stack, Table
+from mivol.config import Detector, Matrices, Measured, Nikon, Stack, ViewTable
 from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.files import read_projections, read_stack
@@ -95,7 +95,7 @@ def read_hdf5_scan(settings: config.ScanExperiment, base: Path, rows: slice) -> 
     scan = read_projections(path, data.group, names, data.angle_unit, _rows_of_file(data.rows, part))
     fields = scan.projections[:, order], scan.flats[:, order], scan.darks[:, order]
     angles = scan.angles
-    if angles is None and not isinstance(settings.scan, Table | Matrices):
+    if angles is None and not isinstance(settings.scan, ViewTable | Matrices):
         angles = even_angles(settings.scan, len(scan.projections))
     elif angles is not None:
         check_unit(np.degrees(angles), "degree", 'set data.angle_unit = "radian"')
@@ -157,7 +157,7 @@ def read_angles(settings: config.ScanExperiment, base: Path, views: int) -> np.n
         MivolError: different numbers of angles and views, or angles in another unit.
     """
     data: Stack = settings.data
-    if isinstance(settings.scan, Table | Matrices):
+    if isinstance(settings.scan, ViewTable | Matrices):
         return None
     if not data.angles:
         return even_angles(settings.scan, views)
@@ -317,7 +317,9 @@ def compare_rows(geometry: FlatDetector, grid: VoxelGrid, y: np.ndarray, weights
     return RowOrder(as_read, upside_down, float(more.mean()) / error)
 
 
-def note_rows(data: config.Readings, geometry: FlatDetector, grid: VoxelGrid, y: np.ndarray, weights: np.ndarray) -> list[str]:
+def note_rows(
+    data: config.ReadingSettings, geometry: FlatDetector, grid: VoxelGrid, y: np.ndarray, weights: np.ndarray
+) -> list[str]:
     """Return a note with a remedy if the rows of measured projections seem to be upside down."""
     if not can_tell(geometry, grid):
         return []

@@ -229,7 +229,7 @@ class Neighbours:
 
 
 @dataclass(frozen=True)
-class Rows:
+class FieldRows:
     """The rows of a parameter of a field, for a decoupled prior.
 
     Attributes:
@@ -268,11 +268,11 @@ class DecoupledPrior(Strategy, tag="decoupled prior"):
 
     weight: Annotated[float, setting("photograph", "number of agreeing photographs that balance the prior", ge=0)] = 1.0
 
-    def make_move(self, rows: Rows) -> Move | None:
+    def make_move(self, rows: FieldRows) -> Move | None:
         """The move; None leaves all values. A spatial prior takes evaluated values."""
         raise NotImplementedError
 
-    def apply(self, values: mi.Float, rows: Rows) -> mi.Float:
+    def apply(self, values: mi.Float, rows: FieldRows) -> mi.Float:
         """Values after the move."""
         return move_values(values, self.make_move(rows))
 
@@ -294,7 +294,7 @@ class Smoothness(DecoupledPrior, tag="smoothness"):
     share: Annotated[float, setting("1", "share of the rows per step", gt=0, le=1)] = 1 / 8
     every: Annotated[int, setting("step", "steps between applications, each to the shares of all these steps", ge=1)] = 1
 
-    def make_move(self, rows: Rows) -> Move | None:
+    def make_move(self, rows: FieldRows) -> Move | None:
         if rows.step % self.every:
             return None
         share, amount = min(self.every * self.share, 1), rows.rate * (self.every * self.weight) / rows.unit
@@ -308,7 +308,7 @@ class Smoothness(DecoupledPrior, tag="smoothness"):
 class Sparsity(DecoupledPrior, tag="sparsity"):
     """The Cauchy prior on a density. Source: Hedman et al. 2021."""
 
-    def make_move(self, rows: Rows) -> Move | None:
+    def make_move(self, rows: FieldRows) -> Move | None:
         amount = rows.rate * self.weight
         return Move(sparsify, (dr.opaque(mi.Float, 4 * amount), rows.unit)) if amount else None
 
@@ -316,7 +316,7 @@ class Sparsity(DecoupledPrior, tag="sparsity"):
 class ViewDependence(DecoupledPrior, tag="view_dependence"):
     """Weight decay on the view-dependent coefficients. These overfit with few photographs."""
 
-    def make_move(self, rows: Rows) -> Move | None:
+    def make_move(self, rows: FieldRows) -> Move | None:
         share = rows.rate * self.weight
         return Move(decay_view_dependence, (rows.width, dr.opaque(mi.Float, 1 - min(share, 1)))) if share else None
 

@@ -208,7 +208,7 @@ def _entry(file: Path, table: Mapping[str, Any], frame: Mapping[str, Any], numbe
     if missing:
         raise refusal(file, f"frame {number} without {missing[0]}", "file_path and transform_matrix", "write it again")
     name = to_forward_slashes(file.parent, str(frame["file_path"]))
-    settings = Settings({**table, **frame}, f"{file.name} {name}")
+    settings = FrameSettings({**table, **frame}, f"{file.name} {name}")
 
     def camera(size: tuple[int, int]) -> Camera:
         lens = settings.lens()
@@ -229,7 +229,7 @@ def _entry(file: Path, table: Mapping[str, Any], frame: Mapping[str, Any], numbe
 
 
 @dataclass(frozen=True)
-class Settings:
+class FrameSettings:
     """The settings of a frame, completed by the settings of the file.
 
     Attributes:

@@ -153,7 +153,7 @@ def _setting(unit: str, meaning: str, **domain: float) -> msgspec.Meta:
 
 Pixels = Annotated[int, _setting("pixel", "edge of the image", ge=1, le=65536)]
 UpAxis = Annotated[Literal["x", "y", "z"], _setting("1", "axis of the world that points up")]
-Count = Annotated[int, _setting("1", "number of views", ge=1, le=65536)]
+ViewCount = Annotated[int, _setting("1", "number of views", ge=1, le=65536)]
 Degrees = Annotated[float, _setting("degree", "angle of the first camera around the object")]
 
 
@@ -229,7 +229,7 @@ class Ring(PlacedRig, frozen=True, tag="ring"):
     both ends.
     """
 
-    count: Count = 8
+    count: ViewCount = 8
     distance: Annotated[float, _setting("radius of the box", "camera to middle", gt=1)] = 4.0
     elevation: Annotated[float, _setting("degree", "height above the horizon", ge=-90, le=90)] = 0.0
     start: Degrees = 0.0
@@ -251,7 +251,7 @@ class Hemisphere(PlacedRig, frozen=True, tag="hemisphere"):
     area, and the azimuth i times the golden angle, 180 (3 - sqrt(5)) degrees.
     """
 
-    count: Count = 16
+    count: ViewCount = 16
     distance: Annotated[float, _setting("radius of the box", "camera to middle", gt=1)] = 4.0
     lowest: Annotated[float, _setting("degree", "lowest elevation; -90 is the whole sphere", ge=-90, lt=90)] = 0.0
     start: Degrees = 0.0

@@ -28,7 +28,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mivol.splatting.projection import EXP2, TILE, Grid
+from mivol.splatting.projection import EXP2, TILE, TileGrid
 
 CHUNK = 4
 """Entries between two stored values of T."""
@@ -115,7 +115,7 @@ class _Lane:
     y: mi.UInt32
 
     @classmethod
-    def of(cls, lists: Lists, grid: Grid) -> _Lane:
+    def of(cls, lists: Lists, grid: TileGrid) -> _Lane:
         lane = dr.arange(mi.UInt32, dr.width(lists.tiles) * LANES)
         tile = dr.gather(mi.UInt32, lists.tiles, lane // LANES)
         start = dr.gather(mi.UInt32, lists.starts, tile)
@@ -156,7 +156,7 @@ class _Footprint:
     colour: list[mi.Float]
 
     @classmethod
-    def of(cls, shape: mi.Float, index: mi.UInt32, there: mi.Bool, lane: _Lane, grid: Grid, discs: bool) -> _Footprint:
+    def of(cls, shape: mi.Float, index: mi.UInt32, there: mi.Bool, lane: _Lane, grid: TileGrid, discs: bool) -> _Footprint:
         x, y, xx, xy, yy, opacity, *colour = dr.gather(mi.ArrayXf, shape, index, there, shape=(8, dr.width(index)))
         dx = [mi.Float(lane.x) + (0.5 + p) - x for p in range(BLOCK)]
         dy = [mi.Float(lane.y) + (0.5 + p) - y for p in range(BLOCK)]
@@ -192,7 +192,7 @@ def _gather_blue_and_depth(rest: mi.Float, index: mi.UInt32, there: mi.Bool, dep
 
 
 def composite(
-    splats: tuple[mi.Float, mi.Float], lists: Lists, grid: Grid, frame: Frame
+    splats: tuple[mi.Float, mi.Float], lists: Lists, grid: TileGrid, frame: Frame
 ) -> tuple[mi.Float, mi.UInt32, mi.Float]:
     """Composite all tiles.
 
@@ -242,7 +242,9 @@ def composite(
     return frame.image, chunk, frame.transmittance
 
 
-def composite_adjoint(splats: tuple[mi.Float, mi.Float], lists: Lists, grid: Grid, frame: Frame, adjoint: Adjoint) -> Adjoint:
+def composite_adjoint(
+    splats: tuple[mi.Float, mi.Float], lists: Lists, grid: TileGrid, frame: Frame, adjoint: Adjoint
+) -> Adjoint:
     """Take the derivative by an image back to the numbers of every splat.
 
     Args:

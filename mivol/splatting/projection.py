@@ -139,7 +139,7 @@ class Splats:
         return [self.colour[2], self.depth]
 
 
-def project(cloud: Cloud, view: View, filtering: Filter, degree: int, compensated: bool) -> Splats:
+def project(cloud: Cloud, view: DeviceCamera, filtering: Filter, degree: int, compensated: bool) -> Splats:
     """Project all Gaussians of a cloud.
 
     Args:
@@ -234,7 +234,7 @@ further out is linearised at this limit (Kerbl et al. 2023: 1.3 times the tangen
 
 
 @dataclass
-class View:
+class DeviceCamera:
     """A pinhole camera on the device.
 
     Attributes:
@@ -258,7 +258,7 @@ class View:
     shift: mi.Vector3f
 
     @classmethod
-    def unpack(cls, numbers: mi.Float) -> View:
+    def unpack(cls, numbers: mi.Float) -> DeviceCamera:
         """The view of the 20 numbers of :func:`pack_view`."""
         read = [dr.gather(mi.Float, numbers, mi.UInt32(k)) for k in range(20)]
         axes = [mi.Vector3f(*read[k : k + 3]) for k in (3, 6, 9)]
@@ -267,7 +267,7 @@ class View:
 
 
 def pack_view(camera: Camera, size: tuple[int, int]) -> mi.Float:
-    """Pack a camera into an array on the device: the numbers of a :class:`View`, in the order of its attributes.
+    """Pack a camera into an array on the device: the numbers of a :class:`DeviceCamera`, in the order of its attributes.
 
     Args:
         camera: without a distorting lens.
@@ -308,7 +308,7 @@ SLACK = 1e-3
 
 
 @dataclass
-class Grid:
+class TileGrid:
     """The tiles of an image, opaque to kernels.
 
     Attributes:
@@ -348,7 +348,7 @@ class _Ellipse:
     drawn: mi.Bool
 
     @classmethod
-    def of(cls, shape: mi.Float, grid: Grid, index: mi.UInt32, drawn: mi.Bool) -> _Ellipse:
+    def of(cls, shape: mi.Float, grid: TileGrid, index: mi.UInt32, drawn: mi.Bool) -> _Ellipse:
         x, y, xx, xy, yy, opacity, _, _ = dr.gather(mi.ArrayXf, shape, index, drawn, shape=(8, dr.width(index)))
         # xx dx^2 + xy dx dy + yy dy^2 = level on its border; all three are negative definite.
         level = dr.log2(grid.least * dr.rcp(dr.maximum(opacity, 1e-30)))
@@ -361,11 +361,11 @@ class _Ellipse:
         top_at = -0.5 * xy * dr.rcp(yy) * reach_x
         return cls(x, y, reach_x, reach_y, top_at, slope, level * dr.rcp(xx), drawn)
 
-    def rows(self, grid: Grid) -> tuple[mi.Int32, mi.Int32]:
+    def rows(self, grid: TileGrid) -> tuple[mi.Int32, mi.Int32]:
         """First row of tiles, and the row behind the last."""
         return _tiles(self.y - self.reach_y, self.y + self.reach_y, grid.rows, self.drawn)
 
-    def columns(self, row: mi.Int32, grid: Grid) -> tuple[mi.Int32, mi.Int32]:
+    def columns(self, row: mi.Int32, grid: TileGrid) -> tuple[mi.Int32, mi.Int32]:
         """First column of tiles in a row of tiles, and the column behind the last."""
         low = mi.Float(row * TILE) + 0.5 - self.y
         high = low + (TILE - 1)
@@ -388,7 +388,7 @@ def _tiles(low: mi.Float, high: mi.Float, count: mi.Int32, drawn: mi.Bool) -> tu
     return mi.Int32(first), mi.Int32(dr.select(drawn, behind, first))
 
 
-def count_tiles(shape: mi.Float, drawn: mi.Bool, grid: Grid) -> mi.UInt32:
+def count_tiles(shape: mi.Float, drawn: mi.Bool, grid: TileGrid) -> mi.UInt32:
     """Count the tiles of each splat.
 
     Args:
@@ -407,7 +407,7 @@ def count_tiles(shape: mi.Float, drawn: mi.Bool, grid: Grid) -> mi.UInt32:
     return count
 
 
-def write_tiles(shape: mi.Float, order: mi.UInt32, offsets: mi.UInt32, target: mi.Int32, grid: Grid) -> mi.Int32:
+def write_tiles(shape: mi.Float, order: mi.UInt32, offsets: mi.UInt32, target: mi.Int32, grid: TileGrid) -> mi.Int32:
     """Write the tiles of some splats.
 
     Args:

@@ -27,11 +27,11 @@ from mivol.splatting.projection import (
     EXP2,
     TILE,
     Cloud,
+    DeviceCamera,
     Filter,
-    Grid,
     Splats,
+    TileGrid,
     TileLists,
-    View,
     check_memory,
     count_tiles,
     list_tiles,
@@ -142,7 +142,7 @@ class Splatter:
         self.n_tiles = columns * rows
         scale = 1 if judged_width is None else width / judged_width
         self._filter = Filter(*(dr.opaque(mi.Float, value) for value in (low_pass * scale**2, near, sheen)))
-        self._grid = Grid(dr.opaque(mi.Int32, columns), dr.opaque(mi.Int32, rows), dr.opaque(mi.Float, least_alpha))
+        self._grid = TileGrid(dr.opaque(mi.Int32, columns), dr.opaque(mi.Int32, rows), dr.opaque(mi.Float, least_alpha))
         self._width, self._height = dr.opaque(mi.UInt32, width), dr.opaque(mi.UInt32, height)
         self._project = RecordedKernel(_trace_projection, degree, compensated)
         self._write, self._composite = RecordedKernel(write_tiles), RecordedKernel(composite)
@@ -292,9 +292,16 @@ class Splatter:
 
 
 def _trace_projection(
-    degree: int, compensated: bool, cloud: Cloud, view: mi.Float, filtering: Filter, grid: Grid, shape: mi.Float, rest: mi.Float
+    degree: int,
+    compensated: bool,
+    cloud: Cloud,
+    view: mi.Float,
+    filtering: Filter,
+    grid: TileGrid,
+    shape: mi.Float,
+    rest: mi.Float,
 ) -> tuple:
-    splats = project(cloud.split(degree), View.unpack(view), filtering, degree, compensated)
+    splats = project(cloud.split(degree), DeviceCamera.unpack(view), filtering, degree, compensated)
     index = dr.arange(mi.UInt32, dr.width(splats.x))
     drawn = splats.drawn & ~splats.faulty
     dr.scatter(shape, mi.ArrayXf(splats.shape()), index)
@@ -306,7 +313,7 @@ def _trace_projection(
 def _trace_adjoint(
     degree: int, compensated: bool, cloud: Cloud, view: mi.Float, filtering: Filter, adjoint: Adjoint, target: Cloud
 ) -> tuple[Cloud, list[mi.Float], mi.Float]:
-    parts, looking = cloud.split(degree), View.unpack(view)
+    parts, looking = cloud.split(degree), DeviceCamera.unpack(view)
     # A motion for each Gaussian: Dr.Jit would add up the derivatives by a single one at each step of the formula.
     nothing = mi.Float(dr.arange(mi.UInt32, dr.width(cloud.opacity_logits)) & 0)
     looking.turn, looking.shift = mi.Vector3f(nothing), mi.Vector3f(nothing)

@@ -15,7 +15,7 @@ import math
 from pathlib import Path
 
 import mivol  # noqa: F401  (chooses the LLVM library; call it before the first variant)
-from mivol.experiments.examples import StandIn
+from mivol.experiments.examples import ProceduralData
 from mivol.files import write_png
 
 import drjit as dr
@@ -23,7 +23,7 @@ import mitsuba as mi
 import numpy as np
 
 HERE = Path(__file__).parent
-STAND_IN = StandIn("tooth", "scan", (161, 94, 103), 240.0)
+STAND_IN = ProceduralData("tooth", "scan", (161, 94, 103), 240.0)
 """Of the size of the scan, which the camera of the scene looks at, up to the last value of the scene's tables."""
 KEYS = {"opacity": "tooth.interior_medium.sigma_t.table", "colour": "tooth.interior_medium.emission.table"}
 FLAT = {"shade": "false", "boundaries": "1, 1"}

@@ -16,7 +16,7 @@ from PIL import Image
 from scene_numbers import numbers_of
 
 from mivol.bench.harness.contests import Timing
-from mivol.bench.scenes import Extinction
+from mivol.bench.scenes import StudyExtinction
 from mivol.bench.studies import (
     cluster,
     cluster_kills,
@@ -127,7 +127,7 @@ def test_arrangements(name: str, variant_rgb: str, monkeypatch: pytest.MonkeyPat
 
 
 WALK, CLOUD = optical_depth.OpticalDepthSize.quick(), points.PointsSize("quick", clouds=((40, 8),), peer=(30, 8), walk_side=16)
-SMOKE = Extinction(np.linspace(0, 2, 60, dtype=np.float32).reshape(3, 4, 5), "made up")
+SMOKE = StudyExtinction(np.linspace(0, 2, 60, dtype=np.float32).reshape(3, 4, 5), "made up")
 
 MEASURED: dict[str, tuple[Callable[[], object], float]] = {
     "clouds": (lambda: points.measure_clouds(CLOUD), 18.8076134),

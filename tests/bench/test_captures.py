@@ -10,7 +10,7 @@ import pytest
 from capture_photos import write_capture
 
 from mivol.bench.studies import captures
-from mivol.bench.studies.captures import RULE, STUDY, CaptureSize, Choice, disturb_poses, leave_each_out
+from mivol.bench.studies.captures import RULE, STUDY, CaptureSize, Variation, disturb_poses, leave_each_out
 from mivol.errors import MivolError
 from mivol.photos import load_photos
 from mivol.photos.region import viewing_distance
@@ -69,7 +69,7 @@ def test_each_capture_is_fitted_with_each_value(
     folders = [tmp_path / name for name in ("one", "two")]
     for folder in folders:
         folder.mkdir()
-    more = Choice("more")
+    more = Variation("more")
     monkeypatch.setattr(captures, "CONSTANTS", {"grid": {"steps": (RULE, more)}})
     monkeypatch.setattr(captures, "choose_judged", lambda fitted, size: [])
     psnr = {("one", RULE): 20.0, ("two", RULE): 24.0, ("one", more): 21.5, ("two", more): 24.25}

@@ -11,7 +11,7 @@ from scene_numbers import add_up
 
 from mivol.bench import scenes
 from mivol.bench.scenes import (
-    Extinction,
+    StudyExtinction,
     as_dense_as_smoke,
     box_scene,
     ct_scan,
@@ -67,7 +67,7 @@ def test_integrators_scatter_once_and_are_made_anew(variant_rgb: str) -> None:
 
 def test_scenes_of_the_benches_are_those_of_the_published_figures(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The sum of all numbers of hard scenes and of the lights of every bench, each times a weight of its place."""
-    grids = lambda res: Extinction(np.full((res // 32,) * 3, res / 7, np.float32), "")  # noqa: E731
+    grids = lambda res: StudyExtinction(np.full((res // 32,) * 3, res / 7, np.float32), "")  # noqa: E731
     monkeypatch.setattr(random_scenes, "smoke", lambda: grids(64))
     monkeypatch.setattr(random_scenes, "threads_in_space", grids)
     monkeypatch.setattr(random_scenes, "as_dense_as_smoke", lambda found: found)
@@ -125,7 +125,7 @@ def test_threads_leave_space_empty() -> None:
 
 def test_as_dense_as_the_smoke() -> None:
     """Its largest extinction, and nothing in the outermost voxels."""
-    result = as_dense_as_smoke(Extinction(np.arange(125, dtype=np.float32).reshape(5, 5, 5), "a ramp"))
+    result = as_dense_as_smoke(StudyExtinction(np.arange(125, dtype=np.float32).reshape(5, 5, 5), "a ramp"))
     assert result.values.max() == pytest.approx(smoke().values.max(), rel=1e-6)
     border = np.ones((5, 5, 5), bool)
     border[1:-1, 1:-1, 1:-1] = False

@@ -20,7 +20,7 @@ from syntax import tree_of
 from tiny_experiment import refused, write_experiment
 
 from mivol import config
-from mivol.bench.studies.cluster import Network, Workload, best_workers, say_limit, step_seconds
+from mivol.bench.studies.cluster import Connection, Workload, best_workers, say_limit, step_seconds
 from mivol.cli import cluster as verbs
 from mivol.cluster import distribution, packages, reference
 from mivol.cluster.address import ClusterSettings, is_loopback, parse_cluster
@@ -465,7 +465,7 @@ def test_images_of_points_are_refused_before_workers_start(tmp_path: Path, capsy
 
 def test_time_of_a_step_by_hand() -> None:
     """12 units of 1 s, 1 MB at 10 MB/s and 0.1 s: a message takes 0.2 s; the fewest seconds are near sqrt(12 / 0.2) = 7.7."""
-    network, step = Network(0.1, 10e6), Workload("a", 12, 1.0, 1e6, owner_seconds=0.5)
+    network, step = Connection(0.1, 10e6), Workload("a", 12, 1.0, 1e6, owner_seconds=0.5)
     assert network.message_seconds(1e6) == pytest.approx(0.2)
     expected = {1: 12.7, 2: 6.9, 5: 4.5, 6: 3.7, 12: 3.9, 1000: 3.9}
     assert {workers: pytest.approx(step_seconds(step, network, workers)) for workers in expected} == expected
@@ -475,7 +475,7 @@ def test_time_of_a_step_by_hand() -> None:
 
 def test_time_of_units_that_stream_by_hand() -> None:
     """Messages overlap with the work: 12 messages of 0.2 s take 2.4 s, as 5 workers do in 3 rounds."""
-    network, views = Network(0.1, 10e6), Workload("a", 12, 1.0, 1e6, streams=True)
+    network, views = Connection(0.1, 10e6), Workload("a", 12, 1.0, 1e6, streams=True)
     assert [round(step_seconds(views, network, workers), 6) for workers in (1, 4, 6, 12)] == [12.0, 3.0, 2.4, 2.4]
     assert say_limit(views, network) == "6 workers: the owner receives images one after another"
     assert say_limit(Workload("b", 3, 1.0, 0.0, streams=True), network) == "3 workers: no more pieces of work"

@@ -12,7 +12,7 @@ from tiny_experiment import SCENE, refused, run, write_experiment
 import mivol
 from mivol import config
 from mivol.experiments import examples
-from mivol.experiments.examples import EXAMPLES, StandIn, examples_folder
+from mivol.experiments.examples import EXAMPLES, ProceduralData, examples_folder
 from mivol.experiments.fit_kind import NullProgress
 from mivol.experiments.references import load_experiment_scene
 from mivol.files import read_volume
@@ -137,7 +137,7 @@ def test_a_wrong_change_of_an_example_is_refused_before_anything_is_made(
 
 
 @pytest.mark.slow_for("lamp", "smoke", "white_smoke")
-@pytest.mark.parametrize("name", [name for name, example in EXAMPLES.items() if isinstance(example.stand_in, StandIn)])
+@pytest.mark.parametrize("name", [name for name, example in EXAMPLES.items() if isinstance(example.stand_in, ProceduralData)])
 def test_a_stand_in_takes_the_place_of_public_data(tmp_path: Path, name: str) -> None:
     """Where the data is not there the settings name a seeded volume of its shape; where it is, they are left alone."""
     example, told = EXAMPLES[name], []

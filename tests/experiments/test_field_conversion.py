@@ -11,7 +11,7 @@ from ball_photos import CUBE, ball, camera
 
 from mivol.cli import main
 from mivol.experiments import field_conversion
-from mivol.experiments.field_conversion import Source, convert_to_network, views_psnr
+from mivol.experiments.field_conversion import Representation, convert_to_network, views_psnr
 from mivol.fields import resampling
 from mivol.fields.field_files import read_field, write_field
 from mivol.fields.gaussian_grid import grid_to_gaussians
@@ -47,7 +47,7 @@ def constant_levels(n: int, densities: tuple[float, ...] = (1.5, 0.4)) -> Spheri
 
 def views_of(field: SphericalGrid) -> list[RayBundle]:
     """The rays of three views."""
-    return list(field_conversion.look_around(Source.from_field(field), 16)())[:3]
+    return list(field_conversion.look_around(Representation.from_field(field), 16)())[:3]
 
 
 @pytest.mark.parametrize("n", [8, 6])
@@ -98,8 +98,8 @@ def test_what_is_converted_shows_its_source(
     said = capsys.readouterr().out
     loss = next(float(line.split(" dB")[0].split()[-1]) for line in said.splitlines() if " dB" in line)
     # Half of the error of black views at least: 6 dB.
-    black = Source.from_field(SphericalGrid.from_dense(np.zeros((2, 2, 2)), np.zeros((2, 2, 2, 1, 3)), CUBE))
-    assert loss > 6 + views_psnr(black, Source.open(sources / source)), said
+    black = Representation.from_field(SphericalGrid.from_dense(np.zeros((2, 2, 2)), np.zeros((2, 2, 2, 1, 3)), CUBE))
+    assert loss > 6 + views_psnr(black, Representation.open(sources / source)), said
 
 
 @pytest.mark.slow
@@ -115,7 +115,7 @@ def test_a_network_shows_its_source(sources: Path, variant_rgb: str, source: str
 
 def test_an_octree_has_leaves_that_many_fine_views_see(variant_rgb: str) -> None:
     """As many views, and as fine, as the docs say: coarse ones look past leaves."""
-    source = Source.from_field(ball(128))
+    source = Representation.from_field(ball(128))
     rays = field_conversion.look_around(source, min(field_conversion.LEAF_EDGE, 4 * 128))
     cameras = rays.__closure__[0].cell_contents
     assert len(cameras) == 48 and {camera.size for camera in cameras} == {(512, 512)}

@@ -15,10 +15,10 @@ from mivol.optim.priors import (
     PRIORS,
     Bounds,
     DecoupledPrior,
+    FieldRows,
     HuberTotalVariation,
     Laplacian,
     Neighbours,
-    Rows,
     Smoothness,
     Sparse,
     TotalVariation,
@@ -177,7 +177,7 @@ def test_which_priors_compare_neighbours() -> None:
 
 def smoothed(values: mi.Float, field: SphericalGrid, amount: float, share: float = 1.0, first: int = 7) -> mi.Float:
     """A smooth density: a step down a slope of 1 is ``amount`` long."""
-    return Smoothness(share=share).apply(values, Rows(1, Neighbours.from_field(field), amount, 1.0, first))
+    return Smoothness(share=share).apply(values, FieldRows(1, Neighbours.from_field(field), amount, 1.0, first))
 
 
 def test_decoupled_priors_descend(variant_rgb: str) -> None:
@@ -250,14 +250,14 @@ def test_smoothing_every_few_steps_covers_the_same_rows(variant_rgb: str) -> Non
     field = SphericalGrid.from_dense(density, np.zeros((4, 4, 8, 1, 3)), CUBE)
     around = Neighbours.from_field(field)
     often, seldom = Smoothness(share=1 / 8), Smoothness(share=1 / 8, every=4)
-    looks = [Rows(1, around, 0.05, 1.0, first, 8) for first in (7, 23, 39, 55)]
+    looks = [FieldRows(1, around, 0.05, 1.0, first, 8) for first in (7, 23, 39, 55)]
     moved = np.array(seldom.apply(field.density, looks[0]))
     shares = [np.array(often.apply(field.density, look)) for look in looks]
     expected = density.reshape(-1) + sum(share - density.reshape(-1) for share in shares)
     # Each row is in one share; sums of float32 numbers of order 1.
     np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-6)
     assert np.count_nonzero(moved != density.reshape(-1)) > 0.9 * len(moved) / 2
-    resting = Rows(1, around, 0.05, 1.0, 7, 9)
+    resting = FieldRows(1, around, 0.05, 1.0, 7, 9)
     np.testing.assert_array_equal(np.array(seldom.apply(field.density, resting)), density.reshape(-1))
 
 

@@ -8,7 +8,7 @@ import pytest
 from ball_photos import draw_tiles
 
 from mivol.errors import MivolError
-from mivol.optim.photographs.field_view import CameraRays
+from mivol.optim.photographs.field_view import PixelRays
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.photos import Camera, Photo, intrinsics, pixel_centres, rays
 from mivol.photos.lens import Fisheye, Lens
@@ -36,7 +36,7 @@ def test_rays_of_a_camera_cover_its_pixels(variant_rgb: str, lens: Lens | Fishey
     pose[:3, :3], pose[:3, 3] = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0], (1, 2, 3)
     pose[:3, 0] *= np.linalg.det(pose[:3, :3])
     camera = Camera(intrinsics(20, 25, 5, 4), (11, 7), pose, lens)
-    view, found = CameraRays.from_camera(camera), np.full((77, 3), np.nan)
+    view, found = PixelRays.from_camera(camera), np.full((77, 3), np.nan)
     for start, count in ((0, 40), (40, view.count - 40)):
         pixel, bundle = view.make(start, count)
         found[np.array(pixel)] = np.array(bundle.d).T

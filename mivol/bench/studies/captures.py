@@ -45,7 +45,7 @@ class CaptureSize(Size):
 
 
 @dataclass(frozen=True)
-class Choice:
+class Variation:
     """A value of a constant.
 
     Attributes:
@@ -86,26 +86,26 @@ def scale_box(factor: float) -> Callable[[Photos], Photos]:
     return scaled
 
 
-RULE = Choice("the rule")
+RULE = Variation("the rule")
 """The preset as it stands."""
 
-CONSTANTS: dict[str, dict[str, tuple[Choice, ...]]] = {
+CONSTANTS: dict[str, dict[str, tuple[Variation, ...]]] = {
     "grid": {
-        "innermost box": (Choice("2/3", change=scale_box(2 / 3)), RULE, Choice("3/2", change=scale_box(3 / 2))),
-        "nested boxes": (Choice("4", change_plan(levels=4, fewer_levels=False)), RULE),
+        "innermost box": (Variation("2/3", change=scale_box(2 / 3)), RULE, Variation("3/2", change=scale_box(3 / 2))),
+        "nested boxes": (Variation("4", change_plan(levels=4, fewer_levels=False)), RULE),
         "total variation of the density": (
-            Choice("x 1/3", scale_plan(tv_density=1 / 3)),
+            Variation("x 1/3", scale_plan(tv_density=1 / 3)),
             RULE,
-            Choice("x 3", scale_plan(tv_density=3)),
+            Variation("x 3", scale_plan(tv_density=3)),
         ),
-        "steps": (Choice("x 1/2", scale_steps(1 / 2)), RULE, Choice("x 2", scale_steps(2))),
-        "distances of points": (Choice("none", change_plan(depth=0.0)), RULE),
-        "free space": (Choice("none", change_plan(free_space=False)), RULE),
+        "steps": (Variation("x 1/2", scale_steps(1 / 2)), RULE, Variation("x 2", scale_steps(2))),
+        "distances of points": (Variation("none", change_plan(depth=0.0)), RULE),
+        "free space": (Variation("none", change_plan(free_space=False)), RULE),
     },
     "gaussians": {
-        "steps": (Choice("x 1/2", scale_steps(1 / 2)), RULE, Choice("x 2", scale_steps(2))),
-        "share of SSIM": (Choice("0", change_plan(ssim=0.0)), RULE, Choice("0.5", change_plan(ssim=0.5))),
-        "largest Gaussian": (Choice("x 1/3", scale_plan(largest=1 / 3)), RULE, Choice("x 3", scale_plan(largest=3))),
+        "steps": (Variation("x 1/2", scale_steps(1 / 2)), RULE, Variation("x 2", scale_steps(2))),
+        "share of SSIM": (Variation("0", change_plan(ssim=0.0)), RULE, Variation("0.5", change_plan(ssim=0.5))),
+        "largest Gaussian": (Variation("x 1/3", scale_plan(largest=1 / 3)), RULE, Variation("x 3", scale_plan(largest=3))),
     },
 }
 """Constants and their values, by the kind of fit."""
@@ -135,7 +135,7 @@ def list_captures(size: CaptureSize) -> dict[str, Path]:
     return folders
 
 
-def fit_capture(folder: Path, kind: str, size: CaptureSize, choice: Choice = RULE, **more: Any) -> PhotoProblem:
+def fit_capture(folder: Path, kind: str, size: CaptureSize, choice: Variation = RULE, **more: Any) -> PhotoProblem:
     """Fit a capture with a value of a constant; ``more`` settings of its table."""
     table, preset = SETTINGS[kind]
     settings = {table: {"preset": preset, "effort": size.effort, **more}}
@@ -228,7 +228,7 @@ def measure_poses(size: CaptureSize) -> dict:
         answer[name] = {}
         for label, change in {"given": RULE.change, "wrong": lambda photos: disturb_poses(photos, size)}.items():
             for moves in (False, True):
-                fitted = fit_capture(folder, "grid", size, Choice(label, change=change), poses=moves)
+                fitted = fit_capture(folder, "grid", size, Variation(label, change=change), poses=moves)
                 views = choose_judged(fitted, size)
                 aligned = [align_view(fitted, view) for view in views]
                 row = {"psnr": fitted.score(views)["psnr"], "psnr_aligned": fitted.score(aligned)["psnr"]}

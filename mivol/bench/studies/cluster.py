@@ -68,7 +68,7 @@ class Workload:
 
 
 @dataclass(frozen=True)
-class Network:
+class Connection:
     """Connection of the owner.
 
     Attributes:
@@ -84,7 +84,7 @@ class Network:
         return self.latency + size / self.bandwidth
 
 
-def step_seconds(work: Workload, network: Network, workers: int) -> float:
+def step_seconds(work: Workload, network: Connection, workers: int) -> float:
     r"""T(W) [s]: time of a step, or of all units that stream.
 
     The owner has one network connection: it sends each worker the inputs of a step and receives its answer, one after another.
@@ -111,12 +111,12 @@ def step_seconds(work: Workload, network: Network, workers: int) -> float:
     return work.owner_seconds + compute + active * message
 
 
-def best_workers(work: Workload, network: Network) -> int:
+def best_workers(work: Workload, network: Connection) -> int:
     """The smallest number of workers with the smallest time."""
     return min(range(1, work.units + 1), key=lambda workers: (step_seconds(work, network, workers), workers))
 
 
-def say_limit(work: Workload, network: Network) -> str:
+def say_limit(work: Workload, network: Connection) -> str:
     """The limit of the scaling, in words."""
     best = best_workers(work, network)
     message = network.message_seconds(work.message_bytes)
@@ -311,7 +311,7 @@ def measure_cluster(size: ClusterSize) -> dict:
     """Time of two workers over one process, overhead of a step, and the model of larger numbers of workers."""
     messages, gradient, reference = measure_messages(size), measure_gradient(size), measure_reference(size)
     photographs = measure_photographs(size)
-    network = Network(messages["latency"], messages["bandwidth"])
+    network = Connection(messages["latency"], messages["bandwidth"])
     rows = [
         {
             "name": load.name,

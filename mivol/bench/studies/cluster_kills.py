@@ -61,7 +61,7 @@ class KillSize(Size):
 MOST_TRIES = 3
 """Runs for each kill: a kill may come too late."""
 
-Verb = Callable[[Pool, Path, str], np.ndarray]
+VerbRun = Callable[[Pool, Path, str], np.ndarray]
 """Runs the work of a verb on a pool into a new folder, by its name; returns the numbers of the result."""
 
 SCENE = ["views.count=4", "views.width=24", "views.height=24", "reference.spp=64", "reference.held_out=[3]", "threads=1",
@@ -92,7 +92,7 @@ def run_validate(pool: Pool, folder: Path, name: str) -> np.ndarray:
     return np.concatenate([run_reference(pool, folder, name), np.ravel(run_render(pool, folder, name))])
 
 
-def run_fit(experiment: str, changes: list[str]) -> Verb:
+def run_fit(experiment: str, changes: list[str]) -> VerbRun:
     """All steps of a fit, from its data to its last iterate."""
 
     def run(pool: Pool, folder: Path, name: str) -> np.ndarray:
@@ -154,7 +154,7 @@ EXPERIMENTS = {
 }
 """Experiments beside the example demo."""
 
-VERBS: dict[str, Verb] = {
+VERBS: dict[str, VerbRun] = {
     "reference": run_reference,
     "render": run_render,
     "validate": run_validate,

@@ -24,7 +24,7 @@ from mivol.bench.photo_fits import FittedProblem, PhotoSize, find_photographs, p
 from mivol.experiments import field_fit
 from mivol.experiments.field_conversion import (
     NETWORK_PRESETS,
-    Source,
+    Representation,
     convert_to_gaussians,
     convert_to_grid,
     convert_to_network,
@@ -79,7 +79,7 @@ def measure_conversions(size: ConversionSize) -> dict:
         begin_fit(prepared.problem, prepared.problem.plan.optimizer, prepared.problem.plan.course()).complete()
         with TemporaryDirectory() as place:
             source = write_model(Path(place), prepared.problem)
-            own = judge(Source.open(source), prepared.judged)
+            own = judge(Representation.open(source), prepared.judged)
             answer[name] = {"psnr": own, "targets": {}}
             say_row(name, psnr=own)
             for kind in KINDS:
@@ -120,16 +120,16 @@ def convert_and_judge(path: Path, kind: str, judged: Photos, size: ConversionSiz
             convert_to_field(path, target, 128, None, variant)
         else:
             convert_to_grid(path, target, None, variant)
-    made = Source.open(target)
+    made = Representation.open(target)
     return {
-        "loss": views_psnr(made, Source.open(path)),
+        "loss": views_psnr(made, Representation.open(path)),
         "psnr": judge(made, judged),
         "mib": target.stat().st_size / 2**20,
         "processor_seconds": watch.processor,
     }
 
 
-def judge(source: Source, judged: Photos) -> float:
+def judge(source: Representation, judged: Photos) -> float:
     """Mean PSNR [dB] of the judged views, over their backgrounds."""
 
     def score(view: Photo) -> ImageScore:

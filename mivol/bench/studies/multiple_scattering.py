@@ -29,7 +29,7 @@ import numpy as np
 
 from mivol.bench.harness.figures import new_figure
 from mivol.bench.scenes import (
-    Extinction,
+    StudyExtinction,
     as_dense_as_smoke,
     constant_light,
     directional_light,
@@ -56,15 +56,15 @@ LIQUID, EDGE = "skim milk", 40.0
 """Liquid in the glass; edge of the box [mm]."""
 
 
-def thin_smoke() -> Extinction:
+def thin_smoke() -> StudyExtinction:
     """The smoke at a twentieth of its density."""
     dense = smoke()
     return dense._replace(values=dense.values * np.float32(THIN))
 
 
-def white_box() -> Extinction:
+def white_box() -> StudyExtinction:
     """A constant grid in a box with an edge of 2."""
-    return Extinction(np.full((4, 4, 4), WHITE_DEPTH / 2, np.float32), "made up: constant")
+    return StudyExtinction(np.full((4, 4, 4), WHITE_DEPTH / 2, np.float32), "made up: constant")
 
 
 def liquid_coefficients(liquid: MeasuredMedium) -> tuple[np.ndarray, np.ndarray]:
@@ -73,12 +73,12 @@ def liquid_coefficients(liquid: MeasuredMedium) -> tuple[np.ndarray, np.ndarray]
     return sigma_s + sigma_a, sigma_s / (sigma_s + sigma_a)
 
 
-def milk() -> Extinction:
+def milk() -> StudyExtinction:
     """Extinction (3,) of the liquid in the glass."""
-    return Extinction(liquid_coefficients(named_medium(LIQUID))[0], f"{LIQUID}, {EDGE:g} mm")
+    return StudyExtinction(liquid_coefficients(named_medium(LIQUID))[0], f"{LIQUID}, {EDGE:g} mm")
 
 
-VOLUMES: dict[str, Callable[[ContestSize], Extinction]] = {
+VOLUMES: dict[str, Callable[[ContestSize], StudyExtinction]] = {
     "smoke": lambda _: smoke(),
     "thin smoke": lambda _: thin_smoke(),
     "cloud": lambda _: les_cloud(),

@@ -31,9 +31,9 @@ from mivol.bench.harness.contests import Contestant, peak_bytes, race, ratio_of,
 from mivol.bench.harness.study import AT_LEAST, AT_MOST, Promise, Size, Study, amount
 from mivol.bench.scenes import (
     TO_WORLD,
-    Extinction,
     GridRays,
     ParameterGradient,
+    StudyExtinction,
     box_scene,
     camera_rays,
     ct_scan,
@@ -84,7 +84,7 @@ def measure_walk(size: OpticalDepthSize) -> dict:
     return {"grid": str(grid), "rays": rays.n, "share_of_rays_in_the_box": hits, **reports}
 
 
-def order_rays(grid: Extinction, side: int) -> dict[str, GridRays]:
+def order_rays(grid: StudyExtinction, side: int) -> dict[str, GridRays]:
     """Camera rays through a grid, in the order of the image and in random order."""
     o, d = camera_rays(side)
     return {"camera order": GridRays(grid.values, o, d), "random order": GridRays(grid.values, *shuffle(o, d))}
@@ -108,7 +108,7 @@ def measure_grids(size: OpticalDepthSize) -> dict:
     return answer
 
 
-def measure_grid(grid: Extinction, size: OpticalDepthSize) -> dict:
+def measure_grid(grid: StudyExtinction, size: OpticalDepthSize) -> dict:
     """Times and steps of walks with and without empty blocks, in both orders of the rays."""
     orders = order_rays(grid, size.grid_side)
     contestants = {

@@ -52,7 +52,7 @@ from mivol.validate.metrics import nrmse
 MEMORY = 2.0
 """Memory of mivol's slabs [GiB]."""
 
-Contestant = Callable[[Path, Path], None]
+Reconstructor = Callable[[Path, Path], None]
 """Reconstructs the views of a folder into slices of another."""
 
 
@@ -112,7 +112,7 @@ def measure_slices(size: ScanSize) -> dict[str, dict[str, float]]:
         beam = write_views(views, size.n, size.views, size.slices)
         grid = VoxelGrid((size.slices, size.n, size.n), 2 / size.n)
         truth = shepp_logan().voxelise(grid, 2)
-        contestants: dict[str, Contestant] = {"mivol": _mivol(slab_settings(views, size.n, MEMORY))}
+        contestants: dict[str, Reconstructor] = {"mivol": _mivol(slab_settings(views, size.n, MEMORY))}
         contestants |= {name: make(beam) for name, (module, make) in PEERS.items() if importlib.util.find_spec(module)}
         for name, run in contestants.items():
             target = Path(folder) / name.replace(" ", "_")
@@ -147,7 +147,7 @@ def slab_settings(views: Path, n: int, memory: float, **solve: Any) -> config.Sc
     )  # fmt: skip
 
 
-def _mivol(settings: config.ScanExperiment) -> Contestant:
+def _mivol(settings: config.ScanExperiment) -> Reconstructor:
     def run(_: Path, target: Path) -> None:
         plan = plan_slabs(settings, Path())
         writer = TiffSlices(target, plan.grid.shape)
@@ -260,7 +260,7 @@ def _measure_whole(size: ScanSize, folder: Path) -> dict[str, float]:
 # -- Peers -----------------------------------------------------------------------------------------------------------------
 
 
-def _slice_by_slice(reconstruct: Callable[[np.ndarray], np.ndarray]) -> Contestant:
+def _slice_by_slice(reconstruct: Callable[[np.ndarray], np.ndarray]) -> Reconstructor:
     def run(views: Path, target: Path) -> None:
         sinograms = read_images(sorted(views.glob("*.tif")))
         writer = TiffSlices(target, (sinograms.shape[1],))
@@ -270,7 +270,7 @@ def _slice_by_slice(reconstruct: Callable[[np.ndarray], np.ndarray]) -> Contesta
     return run
 
 
-def _algotom(beam: ParallelBeam) -> Contestant:
+def _algotom(beam: ParallelBeam) -> Reconstructor:
     reconstruction = importlib.import_module("algotom.rec.reconstruction")
     centre, options = (beam.detector[1] - 1) / 2, {"apply_log": False, "gpu": False, "ratio": None, "filter_name": None}
 
@@ -280,7 +280,7 @@ def _algotom(beam: ParallelBeam) -> Contestant:
     return _slice_by_slice(reconstruct)
 
 
-def _astra(beam: ParallelBeam) -> Contestant:
+def _astra(beam: ParallelBeam) -> Reconstructor:
     astra = importlib.import_module("astra")
     n = beam.detector[1]
     volume, lines = astra.create_vol_geom(n, n), astra.create_proj_geom("parallel", 1.0, n, beam.angles)
@@ -300,7 +300,7 @@ def _astra(beam: ParallelBeam) -> Contestant:
     return _slice_by_slice(reconstruct)
 
 
-PEERS: dict[str, tuple[str, Callable[[ParallelBeam], Contestant]]] = {
+PEERS: dict[str, tuple[str, Callable[[ParallelBeam], Reconstructor]]] = {
     "algotom": ("algotom", _algotom),
     "astra-toolbox": ("astra", _astra),
 }

@@ -54,7 +54,7 @@ from mivol.bench.harness.contests import BudgetSize, agreement_figures, contest_
 from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios, use_plain_ticks
 from mivol.bench.harness.study import AT_LEAST, Bar, Promise, Study, amount, ask, judge_agreement, say_row
 from mivol.bench.scenes import (
-    Extinction,
+    StudyExtinction,
     as_dense_as_smoke,
     box_scene,
     constant_light,
@@ -136,7 +136,7 @@ LIGHTS = {
     "point light near": Light(lambda: point_light(NEAR), 100, True, 24),
 }
 
-VOLUMES: dict[str, Callable[[ContestSize], Extinction]] = {
+VOLUMES: dict[str, Callable[[ContestSize], StudyExtinction]] = {
     "smoke": lambda _: smoke(),
     "fine smoke": lambda size: fine_smoke(size.fine_res),
     "CT": lambda size: as_dense_as_smoke(ct_scan(size.fine_res)),
@@ -152,7 +152,9 @@ COMPARISONS = len(VOLUMES) * len(LIGHTS) * len(PEERS)
 # -- Contests ---------------------------------------------------------------------------------------------------------------
 
 
-def contest_volume(name: str, make: Callable[[ContestSize], Extinction], lights: dict[str, Light], size: ContestSize) -> dict:
+def contest_volume(
+    name: str, make: Callable[[ContestSize], StudyExtinction], lights: dict[str, Light], size: ContestSize
+) -> dict:
     """Let all integrators contend in a volume, in each of its lights; the smoke has curves of error against time."""
     volume = make(size)
     answer: dict = {"grid": str(volume)}
@@ -217,7 +219,7 @@ def emitter_distances(scene: mi.Scene, light: Light, side: int) -> np.ndarray:
 def contest_study(
     module: str,
     doc: str | None,
-    volumes: dict[str, Callable[[ContestSize], Extinction]],
+    volumes: dict[str, Callable[[ContestSize], StudyExtinction]],
     contests: dict[str, dict[str, Light]],
     judged: tuple[str, ...],
     draw: Callable[[dict, Path], None],

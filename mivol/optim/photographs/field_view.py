@@ -32,7 +32,7 @@ from mivol.transport.traversal.leaf_index import LeafIndex
 
 
 @dataclass(frozen=True)
-class CameraRays:
+class PixelRays:
     """Rays through the pixel centres of a camera, by tiles of ``TILE`` x ``TILE``; tiles at the border repeat border pixels.
 
     Attributes:
@@ -45,7 +45,7 @@ class CameraRays:
     directions: mi.Float | None
 
     @classmethod
-    def from_camera(cls, camera: Camera) -> CameraRays:
+    def from_camera(cls, camera: Camera) -> PixelRays:
         """The rays of a camera."""
         if not camera.distortion:
             return cls(camera, None)
@@ -120,7 +120,7 @@ def render_view(
         field known at points, the bias of :mod:`mivol.transport.line_integrals.sampled_rays`; of an octree, the bias of
         :func:`mivol.transport.line_integrals.leaf_radiance.make_leaf_colours`.
     """
-    render, view = prepare_view(field, camera, stop), CameraRays.from_camera(camera)
+    render, view = prepare_view(field, camera, stop), PixelRays.from_camera(camera)
     width, height = camera.size
     values, distance = dr.zeros(mi.Float, 4 * width * height), dr.zeros(mi.Float, width * height)
     at_once = SAMPLED_PASS if isinstance(field, SampledField) else PASS

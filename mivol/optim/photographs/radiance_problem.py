@@ -47,7 +47,7 @@ from mivol.optim.photographs.batch_gradient import (
 from mivol.optim.photographs.photo_colours import GAIN_RATE, SCALES, Exposure, pull_at
 from mivol.optim.photographs.radiance_plan import RadiancePlan
 from mivol.optim.photographs.ray_batches import POINTS_PER_VIEW, DepthRays, RayBatch, RayBatches, sample_depth_rays
-from mivol.optim.priors import Neighbours, Rows
+from mivol.optim.priors import FieldRows, Neighbours
 from mivol.optim.problem import Divide, DividedProblem, Reals, Refinement, SparseProblem, to_tensors
 from mivol.photos.camera import Motions
 from mivol.photos.region import is_free_space, median_distance
@@ -308,12 +308,12 @@ class RadianceProblem(SparseProblem, DividedProblem):
         found: list[tuple[Callable[..., Reals], tuple[Any, ...]]] = [(move_numbers, (single, pull, sky, self.plan.sky_smooth))]
         return [*found, (move_rows, (spatial, self._free))] if spatial or self._free is not None else found
 
-    def _rows(self, iteration: int) -> dict[str, Rows]:
+    def _rows(self, iteration: int) -> dict[str, FieldRows]:
         """Rows for the priors of an iteration, by parameter."""
         density, sh = (rate / len(self.batches.origins) for rate in self.plan.learning_rates(iteration))
         return {
-            "density": Rows(1, self._neighbours, density, self.unit, self._first_row, iteration),
-            "harmonics": Rows(self.field.width, self._neighbours, self.scale.rate * sh, 1.0, self._first_row, iteration),
+            "density": FieldRows(1, self._neighbours, density, self.unit, self._first_row, iteration),
+            "harmonics": FieldRows(self.field.width, self._neighbours, self.scale.rate * sh, 1.0, self._first_row, iteration),
         }
 
     # -- Poses --------------------------------------------------------------------------------------------------------

@@ -61,7 +61,7 @@ class ViewLoss:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class RenderDifference:
     """The difference between a render and its reference.
 
     Attributes:
@@ -113,7 +113,7 @@ class RenderLoss:
 
 def compare_with_reference(
     loss: Loss, renders: Sequence[mi.TensorXf], shares: Sequence[float], reference: mi.TensorXf, weight: float = 1.0
-) -> Comparison:
+) -> RenderDifference:
     r"""Compare a render, or two renders with independent seeds, with a reference.
 
     Args:
@@ -148,7 +148,7 @@ def compare_with_reference(
     value, adjoint = dr.detach(value), dr.detach(dr.grad(image))
     bias = None if bias is None else dr.detach(bias)
     dr.eval(value, bias, adjoint)
-    return Comparison(ViewLoss(value, bias, weight), adjoint)
+    return RenderDifference(ViewLoss(value, bias, weight), adjoint)
 
 
 def split_samples(spp: int, loss: Loss) -> tuple[int, ...]:

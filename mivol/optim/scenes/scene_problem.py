@@ -29,7 +29,7 @@ from mivol.optim.parameters import Parameter, as_tensor, check_names, find, like
 from mivol.optim.problem import LinearizableProblem, Reals, Refinement
 from mivol.optim.scenes.brick_stages import adapt_bricks, bricks_key, check_sparse_parameter
 from mivol.optim.scenes.render_noise import (
-    Comparison,
+    RenderDifference,
     RenderLoss,
     compare_with_reference,
     describe_noise,
@@ -298,7 +298,7 @@ class SceneProblem(LinearizableProblem):
         pairs = enumerate(self.batches)
         return math.fsum(self.compare(s, self.seed_for(iteration, i, PRIMAL), len(self.views)).loss for i, s in pairs)
 
-    def compare(self, batch: RenderBatch, seed: int, n_views: int) -> Comparison:
+    def compare(self, batch: RenderBatch, seed: int, n_views: int) -> RenderDifference:
         """Render a batch; returns the part of the mean loss over ``n_views`` views.
 
         Raises:
@@ -313,7 +313,7 @@ class SceneProblem(LinearizableProblem):
             self.loss, renders, [n / self.spp for n in parts], batch.reference, batch.n_views / n_views
         )
 
-    def remember(self, compared: Sequence[Comparison], energies: Sequence[mi.Float] = ()) -> RenderLoss:
+    def remember(self, compared: Sequence[RenderDifference], energies: Sequence[mi.Float] = ()) -> RenderLoss:
         """The sum of the batches' losses and of priors, stored for :meth:`warning`."""
         self.newest_loss = RenderLoss([c.view for c in compared], energies, is_noise_known=not (self.noisy and self.spp == 1))
         return self.newest_loss
@@ -333,9 +333,9 @@ class SceneProblem(LinearizableProblem):
         """
         self.loss.weight(self.batches[0].reference)
 
-    def linearize(self, reals: Reals) -> Linearization:
+    def linearize(self, reals: Reals) -> SceneLinearization:
         """The problem around ``reals``, with the random numbers of iteration 0."""
-        return Linearization(self, reals)
+        return SceneLinearization(self, reals)
 
     @property
     def warning(self) -> Callable[[], str]:
@@ -366,7 +366,7 @@ class SceneProblem(LinearizableProblem):
         return energies, by_reals
 
 
-class Linearization:
+class SceneLinearization:
     """A scene's problem around one point u: loss, gradient, and products with J^T W J + R''.
 
     Images, J and J^T use the same samples. The gradient has samples of its own if light is sampled.

@@ -61,8 +61,8 @@ from mivol.bench.harness.contests import SEED_STRIDE, Contest, compare_means, co
 from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios
 from mivol.bench.harness.study import AT_LEAST, AT_MOST, Bar, Promise, Study, amount, ask, judge, judge_agreement, say_row
 from mivol.bench.scenes import (
-    Extinction,
     ParameterGradient,
+    StudyExtinction,
     constant_light,
     directional_light,
     emitter_inside,
@@ -84,7 +84,7 @@ DENSE = "sigma_t >= 1"
 
 CONSTANT, SUN, DIRECTIONAL = "constant light", "HG 0.8, sun in a sky", "HG 0.8, directional"
 
-CONTESTS: dict[str, tuple[Callable[[], Extinction], dict[str, Light]]] = {
+CONTESTS: dict[str, tuple[Callable[[], StudyExtinction], dict[str, Light]]] = {
     "smoke": (smoke, {CONSTANT: Light(constant_light, 60), SUN: Light(sun_and_sky, 30)}),
     "deep smoke": (
         smoke,
