@@ -35,14 +35,14 @@ def check_keys(raw: Any, kind: Any, where: str, name: str) -> None:
     Raises:
         MivolError: with the dotted key, and the nearest valid name.
     """
-    struct = struct_of(kind, raw)
+    struct = find_struct(kind, raw)
     if isinstance(raw, list):
         for number, item in enumerate(raw):
             check_keys(item, entry_kind(kind), f"{where}.{number}", name)
     if struct is None or not isinstance(raw, dict):
         return
     tag = struct.__struct_config__.tag_field
-    _check_tag(raw, tag, {s.__struct_config__.tag: s for s in structs_in(kind)}, where, name)
+    _check_tag(raw, tag, {s.__struct_config__.tag: s for s in list_structs(kind)}, where, name)
     fields = {field.name: field for field in msgspec.structs.fields(struct)}
     unknown = next((key for key in raw if key not in fields and key != tag), None)
     if unknown is not None:
@@ -51,7 +51,7 @@ def check_keys(raw: Any, kind: Any, where: str, name: str) -> None:
     hints = get_type_hints(struct)
     for key, value in raw.items():
         if key in hints:
-            dotted, words = f"{where}.{key}".lstrip("."), words_in(hints[key])
+            dotted, words = f"{where}.{key}".lstrip("."), list_words(hints[key])
             if isinstance(value, str) and words and value not in words:
                 raise MivolError(f'{name}: {dotted} = "{value}" is unknown: {suggest_name(value, list(words))}')
             may_be = _is_infinite(fields[key].default) or key in getattr(struct, "may_be_infinite", ())
@@ -73,23 +73,23 @@ def _check_tag(raw: dict[str, Any], tag: str | None, choices: dict[str, type], w
         raise MivolError(f"{name}: {fault}: {suggest_name(str(word), list(choices))}")
 
 
-def structs_in(kind: Any) -> list[type]:
+def list_structs(kind: Any) -> list[type]:
     """Return the structs among the types of a value."""
     if get_origin(kind) is tuple or isinstance(kind, str):
         return []
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         return [kind]
-    return [struct for part in get_args(kind) for struct in structs_in(part)]
+    return [struct for part in get_args(kind) for struct in list_structs(part)]
 
 
-def words_in(kind: Any) -> tuple[str, ...]:
+def list_words(kind: Any) -> tuple[str, ...]:
     """Return the words among which a value of this type is chosen; empty for other types."""
     return tuple(str(word) for part in (kind, *get_args(kind)) if get_origin(part) is Literal for word in get_args(part))
 
 
-def struct_of(kind: Any, raw: Any) -> type | None:
+def find_struct(kind: Any, raw: Any) -> type | None:
     """Return the struct with the tag of ``raw``; the first possible struct if the tag is missing or unknown."""
-    structs = structs_in(kind)
+    structs = list_structs(kind)
     if not structs or not isinstance(raw, dict):
         return None
     tag = structs[0].__struct_config__.tag_field
@@ -165,12 +165,12 @@ def settings_in(kind: type) -> list[Setting]:
         described = next(part for part in (hint, *get_args(hint)) if hasattr(part, "__metadata__"))
         meta = described.__metadata__[0]
         inner = getattr(hint, "__origin__", hint) if described is hint else hint
-        many = get_origin(inner) is tuple and bool(structs_in(get_args(inner)[0]))
-        structs = structs_in(get_args(inner)[0] if many else inner)
+        many = get_origin(inner) is tuple and bool(list_structs(get_args(inner)[0]))
+        structs = list_structs(get_args(inner)[0] if many else inner)
         unset = field.default is msgspec.NODEFAULT or structs
         default = "" if unset else "absent" if field.default is None else to_toml(field.default)
         tags = tuple(str(s.__struct_config__.tag) for s in structs if s.__struct_config__.tag is not None)
-        choices = tags or tuple(filter(None, words_in(inner)))
+        choices = tags or tuple(filter(None, list_words(inner)))
         domain = describe_domain(meta)
         settings.append(Setting(key, default, domain, meta.extra["unit"], meta.description, choices, bool(structs)))
         key += ".0" * many

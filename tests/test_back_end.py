@@ -53,7 +53,7 @@ def check_film_of_a_megapixel() -> None:
 
 def check_scan() -> None:
     settings = SimpleNamespace(solve=SimpleNamespace(solver="pcg"))
-    solver_choice.check_grid(settings, VoxelGrid((20, 30, 40)), rays=1000)
+    solver_choice.check_solver_memory(settings, VoxelGrid((20, 30, 40)), rays=1000)
 
 
 def make_grid_of_an_octree() -> None:
@@ -64,7 +64,7 @@ def make_grid_of_an_octree() -> None:
 TASKS: dict[str, tuple[Callable[[], None], int]] = {
     "a film": (check_film_of_a_megapixel, 36 << 20),
     "a scan": (check_scan, 20 * 24000 + (8 + 28) * 1000),
-    "a grid of a scene": (lambda: start.check_grid("sigma_t.data", (100, 100, 100), "less"), 24 * 10**6),
+    "a grid of a scene": (lambda: start.check_grid_memory("sigma_t.data", (100, 100, 100), "less"), 24 * 10**6),
     "leaves": (lambda: _check_leaves(10**6, 8), 36 * 10**6),
     "the grid of an octree": (make_grid_of_an_octree, (6 * 8**3 + 1) * 4 * (2 + 3 * 9)),
     "the grid of Gaussians": (lambda: _check_grid_memory(np.array([50, 40, 30]), 4, 50), 60000 * 4 * (2 + 3 * 4)),

@@ -24,7 +24,7 @@ from mivol.bench.harness.study import Size, amount, say
 from mivol.bench.scenes import CHECKOUT, DATA, measure_walk_rate, reference_seconds
 from mivol.errors import MivolError
 from mivol.experiments import gaussian_fit
-from mivol.experiments.field_fit import adapt_plan, make_batches, make_plan
+from mivol.experiments.field_fit import adapt_plan, make_batches, make_radiance_plan
 from mivol.experiments.gaussian_fit import make_gaussian_plan, start_gaussians
 from mivol.experiments.octree_fit import adapt_octree_plan, find_preset, make_octree_plan
 from mivol.experiments.photo_data import add_box, read_photos
@@ -172,7 +172,7 @@ def prepare_fit(
     train, judged = read_photos(chosen, Path())
     train = change(add_box(chosen, train))
     if isinstance(chosen, config.FieldExperiment):
-        plan = adapt_plan(adapt(make_plan(chosen)), train)
+        plan = adapt_plan(adapt(make_radiance_plan(chosen)), train)
         problem = RadianceProblem(make_batches(plan, train), train.box, plan, seed)
         return PhotoProblem(problem, train, judged, sum(stage.steps for stage in plan.stages))
     if isinstance(chosen, config.OctreeExperiment):

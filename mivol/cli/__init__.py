@@ -31,7 +31,7 @@ from mivol.cli.flags import (
     validate_flags,
     view_flags,
 )
-from mivol.cli.inputs import convert, draft_scan_of, explain, load_experiment, load_named_scene, parse_defines
+from mivol.cli.inputs import convert, draft_scan_from, explain, load_experiment, load_named_scene, parse_defines
 from mivol.errors import MivolError, MivolWarning
 from mivol.optim.interrupt import Signals
 
@@ -305,7 +305,7 @@ def optimize(arguments: argparse.Namespace) -> None:
     from mivol.experiments.kinds import run_experiment
 
     progress, notes = TerminalProgress(), ()
-    if draft := draft_scan_of(arguments.experiment, arguments):
+    if draft := draft_scan_from(arguments.experiment, arguments):
         settings, base, notes = config.from_dict(draft.raw, str(arguments.experiment)), Path(), draft.lines
         progress.say(notes)
     else:

@@ -36,7 +36,7 @@ def explain(arguments: argparse.Namespace) -> int:
 
         answer = explain_experiment(*load_experiment(arguments.scene, arguments), arguments.output)
     elif find_format(arguments.scene) or (arguments.scene.is_dir() and not is_points_file(arguments.scene)):
-        return explain_photos(arguments.scene, arguments.output)
+        return print_photo_facts(arguments.scene, arguments.output)
     else:
         answer = _explain_file(arguments)
     print(answer.text)
@@ -61,7 +61,7 @@ def explain_array(arguments: argparse.Namespace) -> int | None:
 
     layout = raw_layout(arguments)
     is_array = bool(layout) or holds_volume(check_dataset(arguments.scene, arguments.dataset))
-    if not layout and (draft := draft_scan_of(arguments.scene, arguments, is_array)):
+    if not layout and (draft := draft_scan_from(arguments.scene, arguments, is_array)):
         return explain_scan(draft)
     if not is_array and arguments.scene.suffix.lower() == ".npz":
         from mivol.experiments.field_conversion import describe_field
@@ -86,7 +86,7 @@ def explain_scan(draft: ScanDraft) -> int:
     return int(bool(answer.refusal))
 
 
-def draft_scan_of(path: Path, arguments: argparse.Namespace, is_array: bool = False) -> ScanDraft | None:
+def draft_scan_from(path: Path, arguments: argparse.Namespace, is_array: bool = False) -> ScanDraft | None:
     """Return the settings of a scan without a TOML file; None for other inputs.
 
     An HDF5 file without the layout of a scan counts as a scan if its suffix is no volume suffix, or with ``--set``;
@@ -162,7 +162,7 @@ def check_dataset(path: Path, dataset: str | None) -> Path:
     return path
 
 
-def explain_photos(path: Path, picture: Path | None) -> int:
+def print_photo_facts(path: Path, picture: Path | None) -> int:
     """Print the facts of a data set, and draw the cameras into an image."""
     from mivol.experiments.photo_data import note_on_alpha
     from mivol.photos import survey_photos

@@ -198,7 +198,7 @@ def share_scene_problem(pool: Pool, kind: SceneFit) -> SharedSceneProblem:
     fitted = [sensor for index, sensor in enumerate(kind.sensors) if index not in kind.held_out]
     content = {
         "scene": scene,
-        "settings": config.resolved(settings),
+        "settings": config.list_all_settings(settings),
         "sensors": [encode_sensor(kind.loaded.scene, sensor) for sensor in fitted],
         "names": [view.name for view in alone.views],
         "references": [np.array(view.reference) for view in alone.views],

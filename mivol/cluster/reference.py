@@ -40,7 +40,7 @@ ShowRows = Callable[[list[SweepRow], bool], None]
 """Receives the views, and whether some are under way."""
 
 
-def render_batches(
+def render_batches_in_worker(
     place: Workplace, scene: str, sensor: Any, method: dict[str, Any], pass_spp: int, seed: int, numbers: range
 ) -> tuple[list[np.ndarray], float]:
     """Render batches in a worker.
@@ -174,7 +174,7 @@ class _Queue:
         view.sent = numbers.stop
         setup = view.reference.setup
         args = (self.scene, view.sensor, view.reference.method, setup.pass_spp, setup.identity["seed"], numbers)
-        return Unit((view.number, numbers), render_batches, args, (self.scene,))
+        return Unit((view.number, numbers), render_batches_in_worker, args, (self.scene,))
 
     def take(self, number: int, numbers: range, images: list[np.ndarray], seconds: float) -> None:
         """Give a result to its view; a finished view needs it no more."""

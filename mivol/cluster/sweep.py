@@ -206,7 +206,7 @@ class _SweepOnPool:
         digest = self.pool.share(bundle.digest, {"files": bundle.files}, bundle.size)
         continues = context.resume and not has_absolute_paths(run.settings)
         kept = read_files(context.folder) if continues else {}
-        args = (digest, config.resolved(run.settings), str(self.sweep.base.absolute()), kept, self.sweep.command)
+        args = (digest, config.list_all_settings(run.settings), str(self.sweep.base.absolute()), kept, self.sweep.command)
         return (run, continues), Unit(run.name, run_fit, args, (digest,))
 
     def _check(self) -> None:

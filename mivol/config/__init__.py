@@ -2,7 +2,7 @@
 
 Conventions. The physics stays in Mitsuba's XML. The TOML file names the parameters, the views and the method. An unknown key
 is an error that offers the nearest valid key. The command line (``--set a.b=c``) overrides the file. Paths are relative to the
-TOML file. ``run.json`` keeps the settings of :func:`resolved`.
+TOML file. ``run.json`` keeps the settings of :func:`list_all_settings`.
 
 The modules ``scenes``, ``scans`` and ``photos`` define the settings of each kind of experiment, with unit, domain and meaning
 on a line each.
@@ -212,7 +212,7 @@ def _with_capture(raw: dict[str, Any]) -> dict[str, Any]:
     return raw | {name: CAPTURE[name] | table if isinstance(table, dict) else table for name, table in tables.items()}
 
 
-def resolved(experiment: Experiment) -> dict[str, Any]:
+def list_all_settings(experiment: Experiment) -> dict[str, Any]:
     """Return all settings, defaults included, as dicts and lists."""
     return msgspec.to_builtins(experiment)
 

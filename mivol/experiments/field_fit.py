@@ -60,7 +60,7 @@ class FieldFit(PhotoFit):
     steps = "recorded in the first step, then replayed; recorded anew once in 64 steps, for a new list of occupied cells"
 
     def make_plan(self, settings: FieldExperiment) -> RadiancePlan:
-        return make_plan(settings)
+        return make_radiance_plan(settings)
 
     def describe_method(self) -> tuple[str, list[str]]:
         method = "a sparse grid of density and spherical harmonics, fitted to photographs; preset "
@@ -207,7 +207,7 @@ steps the field stays far from its optimum (12 photographs of wires, held-out vi
 300, and 27.6 with 300 steps in each stage)."""
 
 
-def make_plan(settings: FieldExperiment) -> RadiancePlan:
+def make_radiance_plan(settings: FieldExperiment) -> RadiancePlan:
     """Return the preset of the settings, changed by the other settings.
 
     Raises:

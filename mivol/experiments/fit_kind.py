@@ -143,7 +143,7 @@ class FitKind(ABC):
         self.settings: Any = context.settings
         about = self.describe_run()
         self.record = RunRecord.new(
-            self.settings.title, config=config.resolved(self.settings), command=context.command, **about
+            self.settings.title, config=config.list_all_settings(self.settings), command=context.command, **about
         )
 
     @abstractmethod

@@ -21,7 +21,7 @@ import numpy as np
 from mivol import config
 from mivol.display import to_toml
 from mivol.errors import MivolError
-from mivol.files.dicom_views import DicomViews, has_views, read_views, survey_views
+from mivol.files.dicom_views import DicomViews, has_views, read_views, survey_dicom_views
 from mivol.files.formats import HEAD, read_volume
 from mivol.files.hdf5 import is_hdf5
 from mivol.files.image_stack import IMAGES, read_header_angles, read_images, stack_shape
@@ -283,7 +283,7 @@ def _draft_nikon(path: Path, given: dict[str, Any]) -> ScanDraft:
 
 
 def _draft_dicom(path: Path, given: dict[str, Any]) -> ScanDraft:
-    scan = survey_views(path)
+    scan = survey_dicom_views(path)
     stack = read_views(path)
     views, rows, columns = stack.shape
     lines = [

@@ -63,7 +63,7 @@ def run_experiment(context: RunContext) -> Path:
     if getattr(settings, "slabs", None) is not None:
         return run_slabs(context)
     if context.resume:
-        checkpoint.check_settings(find_checkpoint(context.folder), config.flatten_settings(config.resolved(settings)))
+        checkpoint.check_settings(find_checkpoint(context.folder), config.flatten_settings(config.list_all_settings(settings)))
     choose_back_end(settings.variant, settings.threads)
     kind = KINDS[type(settings)](context)
     kind.record.notes += context.notes

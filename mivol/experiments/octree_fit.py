@@ -193,7 +193,7 @@ class OctreeFit(FieldFit):
             path = run.path / "stages" / f"{name}.npz"
             write_field(path, field.scale_colours(self.photos.white), view=self.home_view)
         written = read_field(path)  # as it is read: rounded values
-        count = count_parts(field)
+        count = describe_parts(field)
         psnr = self.mean_psnr(written.scale_colours(1 / self.photos.white))
         size = path.stat().st_size
         held = 4 * field.numbers if isinstance(field, SampledField) else field.bytes
@@ -241,7 +241,7 @@ class OctreeFit(FieldFit):
         return Explanation(())
 
 
-def count_parts(field: AnyField) -> str:
+def describe_parts(field: AnyField) -> str:
     """Leaves, nodes or numbers of a field, with the word."""
     if isinstance(field, Octree):
         return f"{field.leaves} leaves"

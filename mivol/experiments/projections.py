@@ -22,7 +22,7 @@ from mivol.optim.projections.linear_problems import PoissonCounts
 from mivol.tomography.cone_axis import axis_from_fans, cone_axis_offset
 from mivol.tomography.filtered import covers_circle
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
-from mivol.tomography.panel_views import COLUMNS, PanelViews, helix, panels_from_matrices
+from mivol.tomography.panel_views import COLUMNS, PanelViews, make_helix, panels_from_matrices
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.preprocess import (
     AIR_RANGE,
@@ -103,11 +103,11 @@ def make_beam(settings: config.ScanExperiment, base: Path, angles: np.ndarray, d
     offsets = {"axis_offset": scan.axis_offset, "detector_offset": scan.detector_offset, "tilt": np.radians(scan.tilt)}
     if isinstance(scan, Cone):
         beam = ConeBeam(angles, detector, scan.source_to_axis, scan.source_to_detector, scan.pitch, **offsets)
-        return beam if is_circle(scan) else helix(beam, scan.lift, scan.sources)
+        return beam if is_circle(scan) else make_helix(beam, scan.lift, scan.sources)
     return ParallelBeam(angles, detector, scan.pitch, **offsets)
 
 
-def make_grid(settings: config.ScanExperiment, base: Path) -> VoxelGrid:
+def make_voxel_grid(settings: config.ScanExperiment, base: Path) -> VoxelGrid:
     """Return the voxels.
 
     Raises:

@@ -19,7 +19,7 @@ from mivol.config import Detector, Matrices, Measured, Nikon, Stack, ViewTable
 from mivol.display import with_short_repr
 from mivol.errors import MivolError
 from mivol.files import read_projections, read_stack
-from mivol.files.dicom_views import has_views, survey_views
+from mivol.files.dicom_views import has_views, survey_dicom_views
 from mivol.files.fetch import resolve_path
 from mivol.files.image_stack import ALL, read_header_angles, stack_shape
 from mivol.files.mrc import read_tilt_angles
@@ -168,7 +168,7 @@ def read_angles(settings: config.ScanExperiment, base: Path, views: int) -> np.n
             raise refusal(file, "no motor of a rotation that moves", "one in each header", "give a text file as data.angles")
         angles = motor[1]
     else:
-        angles = survey_views(file).angles if has_views(file) else read_tilt_angles(file)
+        angles = survey_dicom_views(file).angles if has_views(file) else read_tilt_angles(file)
     if len(angles) != views:
         raise MivolError(f"{data.angles} has {len(angles)} angles for {views} projections: give one for each.")
     return to_radians(angles, data.angle_unit)

@@ -20,8 +20,8 @@ from mivol.fields.procedural import make_procedural
 from mivol.files import read_exr, read_volume, stack_layers
 from mivol.files.fetch import PREFIX, resolve_path
 from mivol.machine import check_memory
-from mivol.optim.parameters import find, like
-from mivol.optim.scenes.views import View, check_sizes
+from mivol.optim.parameters import find_key, to_type_of
+from mivol.optim.scenes.views import View, check_image_sizes
 from mivol.scene.explain import describe_light
 from mivol.scene.load import LoadedScene, load_scene
 from mivol.scene.sensors import check_film
@@ -109,7 +109,7 @@ def find_sensors(settings: SceneExperiment, scene: mi.Scene) -> tuple[list[Any],
     held_out = (*settings.reference.held_out, *range(len(sensors), len(sensors) + len(more)))
     sensors += more
     check_film(to_sensor(sensors[0]), SEEN * len(sensors))
-    check_sizes({f"view {index}": to_sensor(sensor) for index, sensor in enumerate(sensors)})
+    check_image_sizes({f"view {index}": to_sensor(sensor) for index, sensor in enumerate(sensors)})
     return sensors, frozenset(held_out)
 
 
@@ -218,7 +218,7 @@ def make_truth(settings: SceneExperiment, base: Path, scene: mi.Scene) -> np.nda
     """
     if settings.truth is None:
         return None
-    find(settings.truth.key, traverse(scene))
+    find_key(settings.truth.key, traverse(scene))
     if settings.truth.file:
         return read_volume(resolve_path(base, settings.truth.file)).values
     truth_settings = settings.truth
@@ -255,5 +255,5 @@ def hold_values(scene: mi.Scene, key: str, values: np.ndarray) -> Iterator[None]
 
 def set_parameter(params: mi.SceneParameters, key: str, values: np.ndarray) -> None:
     """Set a parameter, in the type of the scene's parameter."""
-    params[key] = like(mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32)), params[key])
+    params[key] = to_type_of(mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32)), params[key])
     params.update()

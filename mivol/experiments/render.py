@@ -360,13 +360,13 @@ def render_points(path: Path, framing: Framing, look: PointLook) -> np.ndarray:
     is_cloud = not is_gaussian_file(check_file(path))
     if not is_cloud and look != PointLook():
         raise MivolError(f"{path} holds Gaussians, which have their own shapes: leave out the options for points.")
-    gaussians = gaussians_for(read_points(path), look) if is_cloud else read_gaussians(path)
+    gaussians = to_gaussians(read_points(path), look) if is_cloud else read_gaussians(path)
     place, up, fov, size = framing.complete(None if is_cloud else read_gaussian_view(path))
     camera = make_camera(place or frame_points(gaussians.means, up, fov, size), up, fov, size)
     return decode_srgb(splat_points(gaussians, camera, is_cloud, is_cloud and look.drawn_as == "discs"))
 
 
-def gaussians_for(cloud: PointCloud, look: PointLook) -> Gaussians:
+def to_gaussians(cloud: PointCloud, look: PointLook) -> Gaussians:
     """Round Gaussians of equal radius at the points; points without colours are coloured by their local density."""
     gaussians = points_to_gaussians(cloud, look.opacity)
     if cloud.colours is None:

@@ -28,7 +28,7 @@ from mivol.experiments.projections import (
     grid_of_detector,
     held_out_views,
     make_data,
-    make_grid,
+    make_voxel_grid,
     read_measured,
 )
 from mivol.experiments.run_folder import BestIterate, RunFolder
@@ -37,9 +37,9 @@ from mivol.experiments.solver_choice import (
     GAIN_ITERATIONS,
     ITERATIONS,
     PLAIN_ITERATIONS,
-    check_grid,
     check_noise,
-    choose_storage,
+    check_solver_memory,
+    choose_matrix_storage,
     estimate_noise,
     explain_prior,
     make_prior,
@@ -132,7 +132,7 @@ class ScanFit(FitKind):
 
     def make_problem(self) -> ProjectionProblem:
         walk = self.projector.subset(self.kept)
-        storage = choose_storage(self.settings.solve, walk)
+        storage = choose_matrix_storage(self.settings.solve, walk)
         self.record.plan.append(storage.line)
         return make_problem(self.settings, storage.apply(walk), self.data, self.kept)
 
@@ -183,7 +183,7 @@ class ScanFit(FitKind):
         if self.data.is_noise_known:
             record.results["discrepancy"] = state.residual_norm / expected_residual_norm(problem, self.settings.solve.name)
         said = len(self.data.notes)
-        self.data = subtract_light(self.problem, self.data, state)
+        self.data = subtract_fitted_light(self.problem, self.data, state)
         record.notes += self.data.notes[said:]
         if isinstance(problem, LeastSquares) and problem.gains is not None:
             size = float(np.std(self.data.removed_rings[0]))
@@ -214,7 +214,7 @@ class ScanFit(FitKind):
         # Back-projection alone takes longer than the other steps of this rehearsal.
         cheap = msgspec.structs.replace(settings, solve=msgspec.structs.replace(settings.solve, start="empty"))
         walk = self.projector.subset(self.kept)
-        storage = choose_storage(settings.solve, walk).line
+        storage = choose_matrix_storage(settings.solve, walk).line
         problem = make_problem(cheap, walk, self.data, self.kept)
         make_solver(settings, expected_noise(settings, problem, self.data)).begin(problem)
         for line in (*self.choices, storage):
@@ -228,15 +228,15 @@ def load_scan(settings: config.ScanExperiment, base: Path) -> tuple[VoxelGrid, P
     """Return the voxels and the projections; without a table ``grid``, the voxels hold what the detector sees.
 
     Raises:
-        MivolError: as :func:`make_grid` and :func:`make_data`, or voxels beyond the memory.
+        MivolError: as :func:`make_voxel_grid` and :func:`make_data`, or voxels beyond the memory.
     """
     if settings.grid is not None or isinstance(settings.data, config.Nikon):
-        grid = make_grid(settings, base)
-        check_grid(settings, grid)
+        grid = make_voxel_grid(settings, base)
+        check_solver_memory(settings, grid)
         return grid, make_data(settings, base, grid)
     data = read_measured(settings, base)
     grid = grid_of_detector(data.geometry)
-    check_grid(settings, grid)
+    check_solver_memory(settings, grid)
     return grid, check_data(settings, data, grid)
 
 
@@ -247,7 +247,7 @@ def make_projector(settings: config.ScanExperiment, data: Projections, grid: Vox
         MivolError: more unknowns than memory.
     """
     unknowns = subdivide_grid(grid, settings.solve.supersampling, data.geometry)
-    check_grid(settings, unknowns, math.prod(data.geometry.shape))
+    check_solver_memory(settings, unknowns, math.prod(data.geometry.shape))
     return Projector(data.geometry, unknowns)
 
 
@@ -291,7 +291,7 @@ def view_times(data: Projections) -> np.ndarray:
     return np.linspace(-1.0, 1.0, len(data.y))
 
 
-def subtract_light(problem: ProjectionProblem, data: Projections, state: SolverState) -> Projections:
+def subtract_fitted_light(problem: ProjectionProblem, data: Projections, state: SolverState) -> Projections:
     """Subtract the fitted drift or gains from the line integrals of all views; the fitted views determine them."""
     task = problem.linear_problem
     if problem.light is not None:

@@ -39,7 +39,7 @@ from mivol.experiments.references import (
 from mivol.experiments.run_folder import BestIterate, RunFolder
 from mivol.experiments.start import (
     Start,
-    box_edges,
+    box_edge_lengths,
     check_given_start,
     find_emissive_start,
     grid_to_world,
@@ -55,7 +55,7 @@ from mivol.optim.scenes.views import FINAL, HELD_OUT, RenderBatch, View, derive_
 from mivol.report.cameras import draw_view_cameras
 from mivol.report.pixel_scale import is_preview_due
 from mivol.report.record import Image, PlanLine, Volume, read_metrics
-from mivol.scene.explain import Explanation, describe_light, explain_scene, read_settings
+from mivol.scene.explain import Explanation, describe_light, explain_scene, read_integrator_settings
 from mivol.scene.load import LoadedScene
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import Plan, make_plan
@@ -243,7 +243,7 @@ def resolve_depth(
         Settings with a number, and the reason; unchanged settings if ``max_depth`` is a number.
     """
     if settings.fit.max_depth is None:
-        depth, reason = read_settings(loaded.scene).max_depth, "the scene's integrator has it"
+        depth, reason = read_integrator_settings(loaded.scene).max_depth, "the scene's integrator has it"
     elif settings.fit.max_depth != AUTO:
         return settings, []
     elif truth is None and not isinstance(settings.reference, Rendered):
@@ -446,9 +446,9 @@ class SceneOutputs:
             stem = f"volumes/{parameter.key.replace('.', '_')}_{role}"
             write_volume(self.run.path / f"{stem}.vol", grid, place if is_along_axes else np.eye(4))
             write_volume(self.run.path / f"{stem}.npz", grid, place, metadata={"key": parameter.key, "unit": unit})
-            about = {"quantity": quantity, "unit": unit, "size": box_edges(place), "caption": parameter.key}
+            about = {"quantity": quantity, "unit": unit, "size": box_edge_lengths(place), "caption": parameter.key}
             volumes.append(Volume(path=f"{stem}.npz", role=role, **about))
-        self.run.record.images += film_of_volume(self.run, value, box_edges(place), "y", quantity)
+        self.run.record.images += film_of_volume(self.run, value, box_edge_lengths(place), "y", quantity)
         if not self.best.is_newest:
             stem = f"volumes/{parameter.key.replace('.', '_')}_best"
             write_volume(self.run.path / f"{stem}.npz", self.best.read()[parameter.key], place)

@@ -35,13 +35,13 @@ from mivol.experiments.projections import (
     describe_beam,
     grid_of_detector,
     make_geometry,
-    make_grid,
+    make_voxel_grid,
     read_measured,
 )
 from mivol.experiments.readings import detector_size, read_scan
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.scan_fit import draw_steps, make_problem, make_solver
-from mivol.experiments.solver_choice import choose_storage, estimate_noise, resolve_solver
+from mivol.experiments.solver_choice import choose_matrix_storage, estimate_noise, resolve_solver
 from mivol.files import write_volume
 from mivol.files.atomic import write_whole_text
 from mivol.files.tiff import TiffSlices
@@ -205,7 +205,7 @@ def plan_slabs(settings: config.ScanExperiment, base: Path) -> SlabPlan:
     """
     source = open_source(settings, base)
     has_grid = settings.grid is not None or isinstance(settings.scan, config.OfData)
-    grid = make_grid(settings, base) if has_grid else grid_of_detector(source.beam)
+    grid = make_voxel_grid(settings, base) if has_grid else grid_of_detector(source.beam)
     walk = Projector(source.beam, grid)
     solve, choices = _resolve(settings.solve, source.beam, walk)
     if isinstance(source.beam, ConeBeam):
@@ -363,7 +363,7 @@ def run_slabs(context: RunContext) -> Path:
     state = _read_state(context) if context.resume else {"settings": _fingerprint(settings), "done": {}}
     record = RunRecord.new(
         settings.title,
-        config=config.resolved(settings),
+        config=config.list_all_settings(settings),
         command=context.command,
         method=f"slabs on line integrals of a {describe_beam(settings)}",
         seeds={"noise": getattr(settings.data, "seed", 0)},
@@ -534,7 +534,7 @@ def _iterate(settings: config.ScanExperiment, data: Projections, slab: VoxelGrid
     """Solve a slab as a scan of its own."""
     solve = settings.solve
     projector = Projector(data.geometry, subdivide_grid(slab, solve.supersampling, data.geometry))
-    operator = choose_storage(solve, projector).apply(projector)
+    operator = choose_matrix_storage(solve, projector).apply(projector)
     problem = make_problem(settings, operator, data, np.arange(projector.n_views))
     estimate_noise(problem, solve, data)
     options = make_solver(settings, None).options()
@@ -615,7 +615,7 @@ def _results(plan: SlabPlan, state: dict[str, Any]) -> dict[str, float | None]:
 
 def _fingerprint(settings: config.ScanExperiment) -> dict[str, str]:
     """Settings that a resumed run must share, as text."""
-    return {name: str(value) for name, value in config.flatten_settings(config.resolved(settings)).items()}
+    return {name: str(value) for name, value in config.flatten_settings(config.list_all_settings(settings)).items()}
 
 
 def _read_state(context: RunContext) -> dict[str, Any]:

@@ -142,7 +142,7 @@ FIELDS, FIELDS_OF_ONE_STEP = 10, 3
 """Fields of 4-byte numbers, one per unknown, in an iterative and in a direct solver."""
 
 
-def check_grid(settings: config.ScanExperiment, grid: VoxelGrid, rays: int = 0) -> None:
+def check_solver_memory(settings: config.ScanExperiment, grid: VoxelGrid, rays: int = 0) -> None:
     """Refuse unknowns beyond the memory of this machine, where solvers keep their fields, or of the GPU that takes products.
 
     Args:
@@ -180,7 +180,7 @@ class Storage:
         return store_matrix(walk) if self.is_stored else walk
 
 
-def choose_storage(settings: config.SolveSettings, walk: Projector) -> Storage:
+def choose_matrix_storage(settings: config.SolveSettings, walk: Projector) -> Storage:
     """Estimate memory and time, and choose; nothing is stored yet.
 
     Args:

@@ -44,7 +44,7 @@ from mivol.files.image_files import encode_srgb
 from mivol.optim.events import Upsample, check_for_grids
 from mivol.optim.loop import begin_fit
 from mivol.optim.optimizer import Optimizer
-from mivol.optim.parameters import GRID, Parameter, as_tensor, find
+from mivol.optim.parameters import GRID, Parameter, as_tensor, find_key
 from mivol.optim.photographs.radiance_plan import RadiancePlan, RadianceStage
 from mivol.optim.photographs.radiance_problem import begin_radiance_fit, current_field
 from mivol.optim.photographs.ray_batches import RayBatches
@@ -78,7 +78,9 @@ def make_starts(settings: SceneExperiment, base: Path, scene: mi.Scene) -> list[
     if any(isinstance(event, Upsample) for event in settings.event):
         check_for_grids(len(grids))
     for start in grids:
-        check_grid(start.parameter.name, final_shape(start.value.shape, settings), "let upsample refine less, or start coarser")
+        check_grid_memory(
+            start.parameter.name, final_shape(start.value.shape, settings), "let upsample refine less, or start coarser"
+        )
     return starts
 
 
@@ -91,7 +93,7 @@ def final_shape(shape: Sequence[int], settings: SceneExperiment) -> tuple[int, .
     return (*(n * factor for n in shape[:3]), *shape[3:])
 
 
-def check_grid(key: str, shape: Sequence[int], way_out: str) -> None:
+def check_grid_memory(key: str, shape: Sequence[int], way_out: str) -> None:
     """Refuse a grid beyond the memory.
 
     Raises:
@@ -108,7 +110,7 @@ def make_start(settings: Sought, base: Path, scene: mi.Scene) -> Start:
         MivolError: an unknown parameter, a value outside the domain, an unreadable file, or a grid beyond the memory.
     """
     params = traverse(scene)
-    start_value = as_tensor(params[find(settings.key, params)])
+    start_value = as_tensor(params[find_key(settings.key, params)])
     # A copy: the scene may give the memory behind a view to another tensor when its parameter changes.
     value = np.array(start_value)
     if start_value.ndim < GRID and (settings.shape or settings.start_file):
@@ -120,9 +122,9 @@ def make_start(settings: Sought, base: Path, scene: mi.Scene) -> Start:
         value = read_volume(place_in(base, settings.start_file)).values
     elif settings.start is not None:
         shape = (*settings.shape, start_value.shape[3]) if settings.shape else start_value.shape
-        check_grid(settings.key, shape, "give parameter.shape fewer voxels")
+        check_grid_memory(settings.key, shape, "give parameter.shape fewer voxels")
         value = np.full(shape, check_start(settings, shape), dtype=np.float32)
-    extent = box_edges(grid_to_world(settings.key, scene))[::-1] if value.ndim >= GRID else (1.0, 1.0, 1.0)
+    extent = box_edge_lengths(grid_to_world(settings.key, scene))[::-1] if value.ndim >= GRID else (1.0, 1.0, 1.0)
     parameter = Parameter(settings.key, settings.unit, settings.domain, settings.map, settings.lr, extent, settings.prior)
     parameter.to_reals(mi.TensorXf(np.ascontiguousarray(value)))
     return Start(parameter, value)
@@ -145,7 +147,7 @@ def grid_to_world(key: str, scene: mi.Scene) -> np.ndarray:
     return find_grid_place(traverse(scene).properties[key][2])
 
 
-def box_edges(place: np.ndarray) -> tuple[float, float, float]:
+def box_edge_lengths(place: np.ndarray) -> tuple[float, float, float]:
     """Lengths (x, y, z) of the edges of a grid's box."""
     return tuple(float(edge) for edge in np.linalg.norm(place[:3, :3], axis=0))
 

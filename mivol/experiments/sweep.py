@@ -91,7 +91,7 @@ def is_interrupted(folder: Path, settings: config.Experiment) -> bool:
     from mivol.optim import checkpoint
 
     with suppress(MivolError):
-        checkpoint.check_settings(folder / CHECKPOINT, config.flatten_settings(config.resolved(settings)))
+        checkpoint.check_settings(folder / CHECKPOINT, config.flatten_settings(config.list_all_settings(settings)))
         return read_record(folder).status != "finished"
     return False
 
@@ -163,7 +163,7 @@ def plan_sweep(path: Path, over: Sequence[str], changes: Sequence[str], folder: 
     for combination in itertools.product(*values.values()):
         chosen = dict(zip(values, combination, strict=True))
         settings = config.load(path, [*changes, *(f"{key}={to_toml(value)}" for key, value in chosen.items())])
-        flat = config.flatten_settings(config.resolved(settings))
+        flat = config.flatten_settings(config.list_all_settings(settings))
         digest = hashlib.sha256(msgspec.json.encode(flat, order="sorted")).hexdigest()
         name = run_name(chosen)
         runs.append(SweepRun(name if name not in names else f"{name}-{digest[:8]}", chosen, settings, digest))

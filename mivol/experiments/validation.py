@@ -23,7 +23,7 @@ from mivol.errors import MivolError
 from mivol.experiments.references import set_parameter
 from mivol.experiments.render import Passes, render_in_turn
 from mivol.files import write_whole_text
-from mivol.optim.parameters import as_tensor, find
+from mivol.optim.parameters import as_tensor, find_key
 from mivol.optim.scenes.views import derive_seed
 from mivol.report import figures
 from mivol.scene.explain import describe_light
@@ -205,7 +205,7 @@ def validate_scene(
     """
     scene, camera = loaded.scene, find_sensor(loaded.scene, settings.sensor)
     for key in settings.parameters:
-        find(key, traverse(scene))
+        find_key(key, traverse(scene))
     folder.mkdir(parents=True, exist_ok=True)
     light = describe_light(scene, settings.max_depth)
     integrator = mi.load_dict({"type": "mivol", **light})

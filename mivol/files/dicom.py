@@ -172,7 +172,7 @@ def import_dcmread(path: Path) -> Any:
 
 
 @contextmanager
-def guarded(file: Path) -> Iterator[None]:
+def refuse_unreadable(file: Path) -> Iterator[None]:
     """Refuse what pydicom cannot read: its parsers and decoders raise errors of many classes."""
     try:
         with warnings.catch_warnings():
@@ -186,7 +186,7 @@ def guarded(file: Path) -> Iterator[None]:
 
 
 def _read_header(dcmread: Any, file: Path) -> Any:
-    with guarded(file):
+    with refuse_unreadable(file):
         header = dcmread(file, stop_before_pixels=True, specific_tags=list(KEYWORDS))
     check_elements(file, header, KEYWORDS)
     return header
@@ -198,14 +198,14 @@ def check_elements(file: Path, header: Any, keywords: tuple[str, ...]) -> None:
     Raises:
         MivolError: a damaged element.
     """
-    with guarded(file):
+    with refuse_unreadable(file):
         for keyword in keywords:
             header.get(keyword)
 
 
 def frame_count(header: Any, file: Path) -> int:
     """Number of frames, at most as many as the file has bits: a frame takes one at least, packed or not."""
-    with guarded(file):
+    with refuse_unreadable(file):
         frames, most = int(header.get("NumberOfFrames") or 1), 8 * file.stat().st_size
         if not 1 <= frames <= most:
             raise refusal(file, f"{frames} frames", f"1 to {most} in a file of this size", "correct the header")
@@ -241,7 +241,7 @@ def _name_series(series: dict[str, dict[Path, Any]]) -> dict[str, str]:
 
 
 def _list_slices(file: Path, header: Any) -> list[Slice]:
-    with guarded(file):
+    with refuse_unreadable(file):
         kind = str(header.get("PhotometricInterpretation", "MONOCHROME2"))
         if int(header.get("SamplesPerPixel") or 1) != 1 or not kind.startswith("MONOCHROME"):
             raise refusal(file, f"colours ({kind})", "grey values (MONOCHROME1 or 2)", "name a series of grey values")
@@ -406,7 +406,7 @@ def decode(dcmread: Any, file: Path) -> np.ndarray:
     Raises:
         MivolError: a damaged file, or a compression without its decoder.
     """
-    with guarded(file):
+    with refuse_unreadable(file):
         image = dcmread(file)
         try:
             return image.pixel_array

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.files.dicom import check_elements, decode, find_dicom, frame_count, guarded, import_dcmread, is_dicom_file
+from mivol.files.dicom import check_elements, decode, find_dicom, frame_count, import_dcmread, is_dicom_file, refuse_unreadable
 from mivol.files.npy import check_memory
 from mivol.files.source import refusal
 
@@ -89,7 +89,7 @@ def _views_of(path: Path) -> dict[Path, Any]:
         return {}
     dcmread, views, angles, is_turning = import_dcmread(path), {}, set(), False
     for file in files:
-        with guarded(file):
+        with refuse_unreadable(file):
             header = dcmread(file, stop_before_pixels=True, specific_tags=list(KEYWORDS))
             if "Rows" not in header or header.get("ImageOrientationPatient") is not None:
                 continue
@@ -103,7 +103,7 @@ def _views_of(path: Path) -> dict[Path, Any]:
     return views if len(angles) > 1 or is_turning else {}
 
 
-def survey_views(path: str | os.PathLike) -> DicomViews:
+def survey_dicom_views(path: str | os.PathLike) -> DicomViews:
     """Read the headers of cone-beam views.
 
     Args:
@@ -126,11 +126,11 @@ def survey_views(path: str | os.PathLike) -> DicomViews:
     frames, angles, assumed = [], [], []
     facts: list[tuple[float, ...]] = []
     first = ordered[0][1]
-    with guarded(ordered[0][0]):
+    with refuse_unreadable(ordered[0][0]):
         is_rt = _finder(first, 0)("GantryAngle") is not None
         is_falling = _number(ordered[0][0], _finder(first, 0), "PixelIntensityRelationshipSign") == -1
     for file, header in ordered:
-        with guarded(file):
+        with refuse_unreadable(file):
             count = frame_count(header, file)
             finders = [_finder(header, frame) for frame in range(count)]
             angles += (_gantry_angles if is_rt else _positioner_angles)(file, header, finders, assumed)
@@ -162,13 +162,13 @@ def read_views(path: str | os.PathLike, rows: slice = slice(None)) -> np.ndarray
     """Read the views: values times slope plus intercept, float32 (views, rows, columns), lowest row first.
 
     Args:
-        path: as in :func:`survey_views`.
+        path: as in :func:`survey_dicom_views`.
         rows: rows, counted upwards.
 
     Raises:
-        MivolError: as :func:`survey_views`, or pixels that pydicom cannot decode.
+        MivolError: as :func:`survey_dicom_views`, or pixels that pydicom cannot decode.
     """
-    views = survey_views(path)
+    views = survey_dicom_views(path)
     height, columns = views.pixels
     part = range(height)[rows]
     check_memory(views.path, 4 * len(views.frames) * len(part) * columns)

@@ -26,7 +26,7 @@ MAGIC = b"\x89HDF\r\n\x1a\n"
 
 def read_hdf5(path: Path, dataset: str | None = None) -> VolumeData:
     """Read a dataset (Z, Y, X) or (Z, Y, X, C), on the unit cube because HDF5 stores no placement."""
-    with opened(path) as file:
+    with open_hdf5(path) as file:
         grids = list_grids(file)
         name = select_dataset(path, dataset.strip("/") if dataset else None, list(grids))
         check_storage(path, file[grids[name]])
@@ -62,7 +62,7 @@ def import_h5py(path: Path) -> ModuleType:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Any]:
+def open_hdf5(path: Path) -> Iterator[Any]:
     """Open a file to read.
 
     Raises:
@@ -76,10 +76,10 @@ def opened(path: Path) -> Iterator[Any]:
         raise
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         # A damaged type of numbers is a ValueError, a damaged group a TypeError.
-        raise damaged(path, error) from error
+        raise damaged_file_error(path, error) from error
 
 
-def damaged(path: Path, error: Exception) -> MivolError:
+def damaged_file_error(path: Path, error: Exception) -> MivolError:
     """Return the error that refuses a file that h5py cannot read."""
     reason = " ".join(str(error).split())
     return refusal(path, f"a damaged or foreign file ({reason})", "HDF5", "the file may be truncated: copy it again")
@@ -160,7 +160,7 @@ def read_name(file: Any, path: Path, name: str) -> Any:
     try:
         return find_item(import_h5py(beside).File(beside, "r"), beside, inner)
     except OSError as error:
-        raise damaged(beside, error) from error
+        raise damaged_file_error(beside, error) from error
 
 
 def check_storage(path: Path, dataset: Any) -> None:
@@ -209,7 +209,7 @@ def read_matlab(path: Path, dataset: str | None = None) -> VolumeData:
         MivolError: a damaged file, several arrays and no name, or numbers that are not real.
     """
     if is_hdf5(path):
-        with opened(path) as file:
+        with open_hdf5(path) as file:
             names = {name: held for name, held in list_grids(file).items() if not name.startswith("#")}
             name = select_dataset(path, dataset, list(names))
             check_storage(path, file[names[name]])

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from mivol.files import source
-from mivol.files.dicom_views import has_views, read_views, survey_views
+from mivol.files.dicom_views import has_views, read_views, survey_dicom_views
 from mivol.files.formats import read_volume
 from mivol.files.source import check_file, refusal
 from mivol.files.tiff import TIFF, natural_order
@@ -69,7 +69,7 @@ def stack_shape(path: str | os.PathLike, dataset: str | None = None) -> tuple[in
     Args, raises: as :func:`read_stack`.
     """
     if has_views(Path(path)):
-        views = survey_views(path)
+        views = survey_dicom_views(path)
         return len(views.frames), *views.pixels
     files = _find_files(path)
     if files[0].suffix.lower() in DETECTOR_IMAGES:

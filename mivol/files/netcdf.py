@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.files.hdf5 import MAGIC, check_storage, is_hdf5, opened, to_text
+from mivol.files.hdf5 import MAGIC, check_storage, is_hdf5, open_hdf5, to_text
 from mivol.files.npy import check_memory
 from mivol.files.renderer_grids import UNEVEN, water_extinction
 from mivol.files.source import refusal, select_dataset
@@ -138,7 +138,7 @@ def open_variables(path: Path) -> Iterator[dict[str, Variable]]:
         MivolError: no NetCDF, or a damaged file.
     """
     if is_hdf5(path):
-        with opened(path) as file:
+        with open_hdf5(path) as file:
             yield dict(_list_hdf5(path, file))
         return
     with path.open("rb") as file:

@@ -32,7 +32,7 @@ from mivol.files.hdf5 import (
     is_group,
     is_hdf5,
     list_grids,
-    opened,
+    open_hdf5,
     read_name,
     to_text,
 )
@@ -121,7 +121,7 @@ def read_projections(
             counts that are not finite, or more readings than memory.
     """
     path = check_file(path)
-    with opened(path) as file:
+    with open_hdf5(path) as file:
         scan = _find_scan(file, path, group, names or {})
         stacks = {role: _read_frames(path, role, frames, rows) for role, frames in scan.frames.items()}
         projections = stacks["data"]
@@ -164,7 +164,7 @@ def survey_projections(
     Args, raises: as :func:`read_projections`.
     """
     path = check_file(path)
-    with opened(path) as file:
+    with open_hdf5(path) as file:
         scan = _find_scan(file, path, group, names or {})
         angles, notes = _read_angles(path, scan.angles, angle_unit)
         counts = [_count(scan.frames.get(role)) for role in ("data", "flats", "darks")]
@@ -191,7 +191,7 @@ def is_scan(path: Path) -> bool:
     """Whether a file is HDF5 and has a layout of a scan, NXtomo or Data Exchange."""
     if not (path.is_file() and is_hdf5(path)):
         return False
-    with opened(path) as file:
+    with open_hdf5(path) as file:
         return bool(_nxtomo_entries(file)) or "exchange/data" in file
 
 

@@ -284,7 +284,7 @@ def as_tensor(value: object) -> mi.TensorXf:
     return mi.TensorXf(flat, (dr.width(flat),))
 
 
-def like(tensor: mi.TensorXf, value: object) -> object:
+def to_type_of(tensor: mi.TensorXf, value: object) -> object:
     """The inverse of :func:`as_tensor`, in the type of ``value``."""
     return tensor if isinstance(value, mi.TensorXf) else dr.unravel(type(value), tensor.array)
 
@@ -300,7 +300,7 @@ def check_names(names: Sequence[str]) -> None:
         raise MivolError(f"the parameter {twice} appears twice: keep one entry with one domain, start and map.")
 
 
-def find(name: str, params: mi.SceneParameters) -> str:
+def find_key(name: str, params: mi.SceneParameters) -> str:
     """The key of ``params`` with this name.
 
     Raises:

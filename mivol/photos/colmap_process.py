@@ -8,7 +8,7 @@ with neighbours in the order of names and with photographs that look alike (:fun
 Global structure from motion (Pan et al. 2024) comes first. It averages the rotations of all photographs and finds all positions
 together, so errors do not add up along a chain of photographs. If it leaves out photographs, has a doubtful error, or pairs of
 photographs contradict it, poses are also found one by one (Schönberger and Frahm 2016), and the better model is kept
-(:func:`rate`).
+(:func:`rate_models`).
 
 The job names ``images`` (folder), ``names`` (groups of photographs, one camera for each group), ``order`` (all photographs),
 ``masks`` (folder, or ""), ``database`` and ``models`` (where to write), ``sequential``, ``longest`` (edge of a photograph in
@@ -92,7 +92,7 @@ def run(job: dict) -> None:
         apart = Path(job["models"]) / "one-by-one"
         apart.mkdir()
         others = write_models(pycolmap, pycolmap.incremental_mapping(database, images, apart, options), apart, job)
-        found = max(found, others, key=rate)
+        found = max(found, others, key=rate_models)
     say(models=found)
 
 
@@ -289,7 +289,7 @@ def share_against(model: dict) -> float:
     return against / max(count, 1)
 
 
-def rate(found: list[dict]) -> tuple[float, int]:
+def rate_models(found: list[dict]) -> tuple[float, int]:
     """Photographs of the largest model times the share of pairs that agree with it, and its points.
 
     With wrong poses, fewer matches agree on a point.

@@ -210,7 +210,7 @@ def is_free_space(cameras: Sequence[Camera], points: np.ndarray, reach: float) -
     return free
 
 
-def check_views(cameras: Sequence[Camera], box: np.ndarray) -> None:
+def check_cameras_meet_box(cameras: Sequence[Camera], box: np.ndarray) -> None:
     """Refuse cameras without a ray through the box (:func:`meets_box`).
 
     Raises:

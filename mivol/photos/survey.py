@@ -184,7 +184,7 @@ def _leave_out_views(frames: list[PhotoFrame], box: np.ndarray, is_given: bool) 
     meets = [region.meets_box(frame.camera, box) for frame in frames]
     away = [frame.file.name for frame, does in zip(frames, meets, strict=True) if not does]
     if is_given or len(away) > MOST_AWAY * len(frames):
-        region.check_views([frame.camera for frame in frames], box)
+        region.check_cameras_meet_box([frame.camera for frame in frames], box)
     if not away:
         return frames, []
     kept = [frame for frame, does in zip(frames, meets, strict=True) if does]

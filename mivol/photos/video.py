@@ -166,11 +166,11 @@ def sharpness(frame: np.ndarray) -> float:
 
 def shows_more(last: np.ndarray, frame: np.ndarray) -> bool:
     """Whether a small grey image (H, W) shows depth, or other parts, beside the last kept one."""
-    shift = motion(last, frame)
+    shift = measure_shift(last, frame)
     return shift >= FAR or (shift >= MOTION and parallax(last, frame) >= PARALLAX)
 
 
-def motion(one: np.ndarray, other: np.ndarray) -> float:
+def measure_shift(one: np.ndarray, other: np.ndarray) -> float:
     """Shift between two small grey images of equal size (H, W), over their width."""
     return float(np.hypot(*find_shift(one, other)[0])) / one.shape[1]
 

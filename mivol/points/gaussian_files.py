@@ -253,7 +253,7 @@ PARITY = np.array([1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1])
 """Sign of each basis function of the harmonics, degrees 0 to 3, under half a turn about z: that of its order m."""
 
 
-def turn(gaussians: Gaussians) -> Gaussians:
+def turn_half(gaussians: Gaussians) -> Gaussians:
     """The Gaussians after half a turn about z; twice gives the same Gaussians, with quaternions of the other sign."""
     w, x, y, z = gaussians.quaternions.T
     return Gaussians(
@@ -272,7 +272,7 @@ def attribute_names(degree: int) -> list[str]:
 
 def write_gaussian_glb(file: BinaryIO, gaussians: Gaussians) -> None:
     """Write Gaussians; programs without the extension show coloured points."""
-    turned = turn(gaussians)
+    turned = turn_half(gaussians)
     unit = turned.quaternions / np.linalg.norm(turned.quaternions, axis=1, keepdims=True)
     codes = np.concatenate([turned.base_colours(), turned.opacities()[:, None]], axis=1)
     writer = GlbWriter(scene=0, scenes=[{"nodes": [0]}], nodes=[{"mesh": 0}], extensionsUsed=[EXTENSION])
@@ -315,7 +315,7 @@ def read_gaussian_glb(path: Path) -> Gaussians:
     harmonics = [read_accessor(path, document, data, attributes[name]) for name in attribute_names(degree)]
     if {len(array) for array in (rotations, scales, opacities, *harmonics)} != {len(means)}:
         raise refusal(path, "attributes of different lengths", "one value a Gaussian", "write the file again")
-    return turn(
+    return turn_half(
         Gaussians(
             means, to_log_scales(scales), np.roll(rotations, 1, axis=1), logit(opacities[:, 0]), np.stack(harmonics, axis=1)
         )

@@ -137,7 +137,7 @@ def arrange_cameras(survey: PhotoSurvey) -> Arrangement:
     mean_up = np.mean([f.camera.to_world[:3, 1] for f in survey.frames], axis=0)
     up = int(np.argmax(np.abs(mean_up)))
     strokes = [
-        Strokes(LABELS[split], _colour(split), np.concatenate([outline(f, length) for f in frames]))
+        Strokes(LABELS[split], _colour(split), np.concatenate([frustum_edges(f, length) for f in frames]))
         for split, frames in _by_split(survey).items()
     ]
     return Arrangement(strokes, survey.box, _points(survey), up, survey.levels, bool(mean_up[up] < 0))
@@ -176,7 +176,7 @@ def plot_arrangement(arranged: Arrangement, title: str, path: str | Path | None,
     return figure
 
 
-def outline(frame: PhotoFrame, length: float) -> NDArray:
+def frustum_edges(frame: PhotoFrame, length: float) -> NDArray:
     """Return the edges (8, 2, 3) of a camera's field of view, ``length`` long along its axis; 90 degrees of a wide lens."""
     camera = frame.camera
     corners = np.array([[0, 0], [camera.size[0], 0], camera.size, [0, camera.size[1]]]) - camera.K[:2, 2]

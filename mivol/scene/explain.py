@@ -39,7 +39,7 @@ UNLIMITED = 0xFFFFFFFF
 """The depth printed by Mitsuba's integrators for -1."""
 
 
-def read_settings(scene: mi.Scene) -> Settings:
+def read_integrator_settings(scene: mi.Scene) -> Settings:
     """Read the settings of the scene's integrator: all of mivol, or the depth and ``hide_emitters`` of another integrator."""
     integrator = scene.integrator()
     session = getattr(integrator, "session", None)
@@ -58,7 +58,7 @@ def describe_light(scene: mi.Scene, max_depth: int | None = None) -> dict[str, A
         scene: the scene.
         max_depth: another longest path; None means the scene's.
     """
-    settings = read_settings(scene)
+    settings = read_integrator_settings(scene)
     depth = settings.max_depth if max_depth is None else max_depth
     return {"max_depth": depth, "hide_emitters": settings.hide_emitters}
 
@@ -92,7 +92,7 @@ def explain_scene(
         Facts and choices with their reasons, and a refusal separately.
     """
     eye = find_sensor(scene, sensor)
-    settings = read_settings(scene)
+    settings = read_integrator_settings(scene)
     if max_depth is not None:
         settings = replace(settings, max_depth=max_depth)
     try:

@@ -84,9 +84,9 @@ def put(node: Node, key: str, value: object) -> None:
     """Add a property to an object."""
     if isinstance(value, np.ndarray) and value.shape == (4, 4):
         transform = ElementTree.SubElement(node, "transform", name=key)
-        ElementTree.SubElement(transform, "matrix", value=words(value.ravel()))
+        ElementTree.SubElement(transform, "matrix", value=to_text(value.ravel()))
     elif isinstance(value, np.ndarray):
-        ElementTree.SubElement(node, "rgb", name=key, value=words(value))
+        ElementTree.SubElement(node, "rgb", name=key, value=to_text(value))
     elif isinstance(value, bool):
         ElementTree.SubElement(node, "boolean", name=key, value=str(value).lower())
     else:
@@ -94,7 +94,7 @@ def put(node: Node, key: str, value: object) -> None:
         ElementTree.SubElement(node, tag, name=key, value=str(value))
 
 
-def words(numbers: np.ndarray) -> str:
+def to_text(numbers: np.ndarray) -> str:
     """Numbers as a text, with nine digits."""
     return " ".join(f"{float(number):.9g}" for number in numbers)
 
@@ -165,7 +165,7 @@ class MediaWriter:
         elif "Le" in each.parameters:
             Le = to_rgb(each.parameters["Le"], 0, is_light=True)
             if "Lescale" in each.parameters:
-                extra.append(("mivol_voxels", self.grid_file(each, "Lescale", shape, bounds, 1) | {"scale": words(Le)}))
+                extra.append(("mivol_voxels", self.grid_file(each, "Lescale", shape, bounds, 1) | {"scale": to_text(Le)}))
             else:
                 extra.append(("", Le))
         return self.make_grid(each, density, extra, bounds)
@@ -230,7 +230,7 @@ class MediaWriter:
 
         def write(shape: Node) -> Node:
             medium = self.write(shape, each, albedo=albedo, **({"scale": float(sigma_t[0])} if is_grey else {}))
-            add(medium, "volume", "mivol_voxels", "sigma_t", **density, **({} if is_grey else {"scale": words(sigma_t)}))
+            add(medium, "volume", "mivol_voxels", "sigma_t", **density, **({} if is_grey else {"scale": to_text(sigma_t)}))
             for kind, properties in lights:
                 if kind:
                     add(medium, "volume", kind, "emission", **properties)
@@ -489,12 +489,12 @@ class _Scene:
             L = to_rgb(each.parameters.get("L"), 1.0, is_light=True) * scale
             direction = transform[:3, :3] @ (end - begin)
             node = add(self.root, "emitter", "directional", irradiance=L)
-            ElementTree.SubElement(node, "vector", name="direction", value=words(direction))
+            ElementTree.SubElement(node, "vector", name="direction", value=to_text(direction))
             return
         if each.type == "point":
             place = each.numbers("from") if "from" in each.parameters else np.zeros(3)
             node = add(self.root, "emitter", "point", intensity=to_rgb(each.parameters.get("I"), 1.0, is_light=True) * scale)
-            ElementTree.SubElement(node, "point", name="position", value=words((transform @ [*place, 1])[:3]))
+            ElementTree.SubElement(node, "point", name="position", value=to_text((transform @ [*place, 1])[:3]))
             return
         self.counts["emitter"] -= 1
         self.left_out.append(f"the light {each.type!r}")

@@ -97,7 +97,7 @@ def _first_index(wrong: np.ndarray) -> int:
     return int(np.flatnonzero(wrong)[0])
 
 
-def helix(beam: ConeBeam, lift: float, shifts: Sequence[Sequence[float]] = ()) -> PanelViews:
+def make_helix(beam: ConeBeam, lift: float, shifts: Sequence[Sequence[float]] = ()) -> PanelViews:
     """Lift source and detector of a cone beam with the angle, and give it several sources.
 
     Args:

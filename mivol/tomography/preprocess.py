@@ -355,7 +355,7 @@ def to_line_integrals(transmission: Transmission, n_sigma: float = 3.0) -> tuple
     return np.where(seen, -np.log(safe), 0.0), np.where(seen, safe**2 / np.where(seen, variance, 1.0), 0.0)
 
 
-def subtract_light(y: np.ndarray, weights: np.ndarray, scatter: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+def subtract_scatter(y: np.ndarray, weights: np.ndarray, scatter: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
     """Line integrals of the light that was not scattered, and their weights; both are 0 at pixels darker than the scatter.
 
     Args:

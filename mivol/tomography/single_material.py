@@ -22,7 +22,7 @@ from scipy.optimize import minimize_scalar
 from mivol.errors import MivolError
 from mivol.tomography.filtered import feldkamp, filtered_backprojection
 from mivol.tomography.geometry import ParallelBeam
-from mivol.tomography.preprocess import Transmission, interpolate_gaps, subtract_light
+from mivol.tomography.preprocess import Transmission, interpolate_gaps, subtract_scatter
 from mivol.tomography.projector import Projector
 
 KEV_METRES = 1.239841984e-9
@@ -101,7 +101,7 @@ class Hardening:
 
     def straighten(self, y: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Straightened line integrals and their weights; pixels darker than the scattered light get weight 0."""
-        primary, weights = subtract_light(y, weights, self.scatter)
+        primary, weights = subtract_scatter(y, weights, self.scatter)
         slope = 1 + sum(k * c * primary ** (k - 1) for k, c in enumerate(self.coefficients, 2))
         return _evaluate(self.coefficients, primary), weights / slope**2
 

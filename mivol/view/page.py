@@ -157,7 +157,7 @@ def start_server(port: int, token: str) -> Any:
         raise MivolError(f"--port {port}: found no port, expected 1 to 65535; leave it out for {PORT}.")
 
     found = {"port": port}
-    with guard_server(token, lambda: found["port"]), quiet():
+    with guard_server(token, lambda: found["port"]), silence_viser():
         server = viser.ViserServer(host=LOOPBACK, port=port, label="mivol view", verbose=False)
         found["port"] = server.get_port()
     try:
@@ -174,7 +174,7 @@ def start_server(port: int, token: str) -> Any:
 
 
 @contextmanager
-def quiet() -> Any:
+def silence_viser() -> Any:
     """Keep viser's own lines from the terminal."""
     import rich
 
@@ -459,7 +459,7 @@ class Page:
 
     def stop(self) -> None:
         """Close the server."""
-        with quiet():
+        with silence_viser():
             self.server.stop()
 
 

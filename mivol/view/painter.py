@@ -80,7 +80,7 @@ def scale_camera(camera: Camera, longest: int) -> Camera:
     return replace(camera, K=intrinsics(focal, focal, width / 2, height / 2), size=(width, height))
 
 
-def strip(camera: Camera, top: int, rows: int) -> Camera:
+def crop_rows(camera: Camera, top: int, rows: int) -> Camera:
     """The camera that sees some rows of the image."""
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2] - top
     return replace(camera, K=intrinsics(fx, fy, cx, cy), size=(camera.size[0], rows))
@@ -231,7 +231,7 @@ class Painter:
             pieces *= 2
         top = sum(map(len, canvas.rows))
         rows = min(-(-height // pieces), height - top)
-        canvas.rows = (*canvas.rows, self._timed(strip(camera, top, rows), canvas.passes))
+        canvas.rows = (*canvas.rows, self._timed(crop_rows(camera, top, rows), canvas.passes))
         if top + rows < height:
             return
         values, canvas.rows = np.concatenate(canvas.rows), ()

@@ -30,8 +30,8 @@ from mivol.experiments.render import (
     PointLook,
     choose_integrator,
     frame_points,
-    gaussians_for,
     sky_beside,
+    to_gaussians,
 )
 from mivol.experiments.run_folder import NEWEST, PHOTOGRAPHS
 from mivol.fields.field_archives import read_field_view
@@ -125,7 +125,7 @@ class Subject(ABC):
         return HomeView(tuple(up), tuple(place[:3]), tuple(place[3:]), fov, size)
 
 
-def inside(places: np.ndarray, box: Sequence[float]) -> np.ndarray:
+def are_inside(places: np.ndarray, box: Sequence[float]) -> np.ndarray:
     """Which places (N, 3) lie in a box, bool (N,)."""
     low, high = np.reshape(np.asarray(box, np.float64), (2, 3))
     return ((places >= low) & (places <= high)).all(axis=1)
@@ -162,7 +162,7 @@ class FieldSubject(Subject):
         if box is None:
             return self.field
         field = self.field
-        stored, kept = field.stored_nodes(), np.flatnonzero(inside(field.node_positions(), box))
+        stored, kept = field.stored_nodes(), np.flatnonzero(are_inside(field.node_positions(), box))
         density, sh = field.values()
         if not len(kept):
             # A field without a node cannot be drawn: one node of vacuum is nothing too.
@@ -172,7 +172,7 @@ class FieldSubject(Subject):
     def save_crop(self, folder: Path, box: Sequence[float]) -> Path:
         if not self.can_crop:
             return super().save_crop(folder, box)
-        if not inside(self.field.node_positions(), box).any():
+        if not are_inside(self.field.node_positions(), box).any():
             raise MivolError("the box holds nothing of the field: make it larger.")
         cropped = self.crop(box)
         path = new_file(folder, f"{self.name}-crop", ".npz")
@@ -192,14 +192,14 @@ class GaussianSubject(Subject):
     def __init__(self, path: Path) -> None:
         is_cloud = not is_gaussian_file(check_file(path))
         cloud = read_points(path) if is_cloud else None
-        self._begin(path.stem, read_gaussians(path) if cloud is None else gaussians_for(cloud, PointLook()), cloud)
+        self._begin(path.stem, read_gaussians(path) if cloud is None else to_gaussians(cloud, PointLook()), cloud)
         self.home = None if is_cloud else read_gaussian_view(path)
 
     @classmethod
     def of_points(cls, name: str, cloud: PointCloud) -> GaussianSubject:
         """Points as discs."""
         subject = cls.__new__(cls)
-        subject._begin(name, gaussians_for(cloud, PointLook()), cloud)
+        subject._begin(name, to_gaussians(cloud, PointLook()), cloud)
         return subject
 
     def _begin(self, name: str, gaussians: Gaussians, cloud: PointCloud | None) -> None:
@@ -215,7 +215,7 @@ class GaussianSubject(Subject):
         if look.crop != self._cropped[0]:
             kept = self.gaussians
             if look.crop is not None:
-                kept = kept.select(inside(kept.means, look.crop))
+                kept = kept.select(are_inside(kept.means, look.crop))
             self._cropped = look.crop, to_tensors(kept)
         if camera.size not in self._splatters:
             is_cloud = self.cloud is not None
@@ -227,7 +227,7 @@ class GaussianSubject(Subject):
         return np.array(image)[..., :3]
 
     def save_crop(self, folder: Path, box: Sequence[float]) -> Path:
-        kept = inside(self.gaussians.means, box)
+        kept = are_inside(self.gaussians.means, box)
         if not kept.any():
             raise MivolError(f"the box holds none of the {len(kept)} Gaussians or points: make it larger.")
         path = new_file(folder, f"{self.name}-crop", ".ply")

@@ -32,7 +32,7 @@ from mivol.bench.harness.contests import (
     mean_of_pixels,
     mean_of_rounds,
     race,
-    ratio_of,
+    time_ratio,
 )
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
 from mivol.bench.harness.study import (
@@ -335,8 +335,8 @@ def test_ratios_are_medians_of_rounds() -> None:
     """2 in two rounds and 10 in one: neither the mean nor the ratio of medians."""
     slow = Timing({}, [2.0, 40.0, 60.0], [3.0, 3.0, 3.0])
     fast = Timing({}, [1.0, 20.0, 6.0], [1.0, 1.0, 3.0])
-    assert ratio_of(slow, fast) == 2
-    assert ratio_of(slow, fast, "processor") == 3
+    assert time_ratio(slow, fast) == 2
+    assert time_ratio(slow, fast, "processor") == 3
     report = slow.report(80, "rays")
     assert (report["seconds_median"], report["seconds_min"], report["rays_per_second_median"]) == (40, 2, 2)
     assert report["rays_per_second_best"] == 40
@@ -455,5 +455,5 @@ def test_the_largest_change_comes_first() -> None:
     own = {"machine": {"cores": 2}, "versions": {"a": 1}, "date": "a", "threads": 2, "load_before_and_after": [1]}
     own |= {"seconds": 3, "bars": [4]}
     walk = {"seconds": 2.0, "on": True, "name": "x", "costs": [1, {"machine": 5}]}
-    numbers = catalogue.numbers_in(own | {"walk": walk})
+    numbers = catalogue.list_numbers(own | {"walk": walk})
     assert numbers == [("walk.seconds", 2.0), ("walk.costs.0", 1.0), ("walk.costs.1.machine", 5.0)]

@@ -16,7 +16,7 @@ from mivol import config
 from mivol.errors import MivolError
 from mivol.optim.priors import TotalVariation
 from mivol.optim.second_order import GaussNewton
-from mivol.schema import describe, describe_domain, settings_in, structs_in
+from mivol.schema import describe, describe_domain, list_structs, settings_in
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALLEST = """
@@ -45,7 +45,7 @@ def test_defaults_and_given_values() -> None:
 
 def test_resolved_settings_are_an_experiment_again() -> None:
     found = config.from_dict(raw())
-    again = config.from_dict(config.resolved(found))
+    again = config.from_dict(config.list_all_settings(found))
     assert again == found
 
 
@@ -71,7 +71,7 @@ def test_command_line_overrides_the_file(tmp_path: Path) -> None:
 
 
 def test_flat_names_everything_that_changes_the_result() -> None:
-    flat = config.flatten_settings(config.resolved(config.from_dict(raw())))
+    flat = config.flatten_settings(config.list_all_settings(config.from_dict(raw())))
     assert flat["parameter.0.prior.0.weight"] == 0.5
     assert flat["optimizer.beta_1"] == 0.9
     assert not {"title", "output", "threads"} & set(flat)
@@ -153,7 +153,7 @@ def test_the_schema_is_strict() -> None:
     for struct in seen:
         assert struct.__struct_config__.forbid_unknown_fields, struct
         for field in msgspec.structs.fields(struct):
-            seen += [s for s in structs_in(getattr(field.type, "__origin__", field.type)) if s not in seen]
+            seen += [s for s in list_structs(getattr(field.type, "__origin__", field.type)) if s not in seen]
     assert len(seen) > 12
 
 

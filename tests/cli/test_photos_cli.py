@@ -14,7 +14,7 @@ from tiny_experiment import write_experiment
 
 from mivol.cli import main
 from mivol.photos import survey_photos
-from mivol.report.cameras import box_edges, outline, plot_cameras
+from mivol.report.cameras import box_edges, frustum_edges, plot_cameras
 
 SCENE = """<scene version="3.0.0">
     <emitter type="constant"/>
@@ -144,7 +144,7 @@ def test_exports_of_phones_are_named(
 def test_drawn_cameras_lie_in_the_world(tmp_path: Path) -> None:
     """Every line of a camera begins at it or ends on its field of view, which opens towards what it looks at."""
     frame = survey_photos(write_blender(tmp_path / "set")).frames[0]
-    edges = outline(frame, 0.5)
+    edges = frustum_edges(frame, 0.5)
     np.testing.assert_allclose(edges[:4, 0], np.tile(frame.camera.origin, (4, 1)))
     np.testing.assert_allclose((edges[:4, 1] - frame.camera.origin) @ frame.camera.forward, 0.5)
     lengths = np.ptp(box_edges(np.array([[0, 0, 0], [1, 2, 3]])), axis=1).sum(axis=1)

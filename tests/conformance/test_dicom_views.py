@@ -16,7 +16,7 @@ from mivol.cli import main
 from mivol.experiments.found_scan import draft_scan, find_scan
 from mivol.experiments.projections import read_measured
 from mivol.files import read_stack, read_volume
-from mivol.files.dicom_views import has_views, survey_views
+from mivol.files.dicom_views import has_views, survey_dicom_views
 
 ANGLES = np.array([-20.0, -5.0, 10.0, 31.5, 90.0])
 
@@ -67,16 +67,16 @@ def test_rays_and_light_are_those_of_the_header(tmp_path: Path, kind: str) -> No
 def test_increments_are_steps_or_distances(tmp_path: Path) -> None:
     """Equal increments are steps; the first of as many as frames belongs to the first frame."""
     steps = write_angiography(tmp_path / "a.dcm", ANGLES, PositionerPrimaryAngleIncrement=[0.0, 2.0, 2.0, 2.0, 2.0])
-    found = survey_views(steps)
+    found = survey_dicom_views(steps)
     np.testing.assert_array_equal(found.angles, -20 + 2.0 * np.arange(5))
     assert found.assumed[0] == "the increments of the positioner's angle are steps from frame to frame, because they are equal"
     four = write_angiography(tmp_path / "b.dcm", ANGLES, PositionerPrimaryAngleIncrement=[1.0, 3.0, 6.0, 10.0])
-    np.testing.assert_array_equal(survey_views(four).angles, -20 + np.array([0.0, 1, 3, 6, 10]))
+    np.testing.assert_array_equal(survey_dicom_views(four).angles, -20 + np.array([0.0, 1, 3, 6, 10]))
 
 
 def test_distances_that_are_assumed(tmp_path: Path) -> None:
     by_factor = {"DistanceSourceToPatient": None, "EstimatedRadiographicMagnificationFactor": 1.5}
-    found = survey_views(write_angiography(tmp_path / "a.dcm", ANGLES, **by_factor))
+    found = survey_dicom_views(write_angiography(tmp_path / "a.dcm", ANGLES, **by_factor))
     assert found.source_to_axis == 60 and "by EstimatedRadiographicMagnificationFactor 1.5" in found.assumed[1]
 
 
@@ -118,10 +118,10 @@ def test_views_that_disagree_are_refused(tmp_path: Path) -> None:
     image = pydicom.dcmread(folder / "003.dcm")
     image.RadiationMachineSAD = 61.0
     image.save_as(folder / "003.dcm")
-    assert_refused("source to axis 61 in view 3 and 60 in view 1, expected one circle", survey_views, folder)
+    assert_refused("source to axis 61 in view 3 and 60 in view 1, expected one circle", survey_dicom_views, folder)
     image.RadiationMachineSAD, image.SeriesInstanceUID = 60.0, "1.2.4"
     image.save_as(folder / "003.dcm")
-    assert_refused("views of 2 series", survey_views, folder)
+    assert_refused("views of 2 series", survey_dicom_views, folder)
 
 
 def test_views_are_a_scan_and_slices_a_volume(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,7 +29,7 @@ from mivol.files.image_files import decode_srgb
 from mivol.files.mesh import Atlas, Mesh, read_accessor, read_glb, turn_to_y, write_mesh
 from mivol.photos.camera_path import HomeView
 from mivol.points import Gaussians
-from mivol.points.gaussian_files import GAUSSIAN_WRITERS, read_gaussians, turn, write_gaussians
+from mivol.points.gaussian_files import GAUSSIAN_WRITERS, read_gaussians, turn_half, write_gaussians
 from mivol.points.sog import fit_palette, fit_table, morton_order
 from mivol.splatting import Splatter, to_tensors
 
@@ -107,7 +107,7 @@ def test_2d_gaussians_are_refused_by_name(tmp_path: Path) -> None:
 def test_half_a_turn_turns_everything(variant_rgb: str) -> None:
     """Covariances by the matrix, colours by their values along turned directions; twice is the same."""
     one, matrix = random_gaussians(20, 3), np.diag([-1.0, -1.0, 1.0])
-    turned = turn(one)
+    turned = turn_half(one)
     assert np.allclose(turned.covariances(), matrix @ one.covariances() @ matrix, atol=1e-6)
     rng = np.random.default_rng(0)
     d = rng.normal(size=(50, 3))
@@ -119,7 +119,7 @@ def test_half_a_turn_turns_everything(variant_rgb: str) -> None:
 
     before = np.einsum("db,nbc->dnc", basis(d), one.harmonics)
     assert np.allclose(np.einsum("db,nbc->dnc", basis(d @ matrix), turned.harmonics), before, atol=1e-5)
-    again = turn(turned)
+    again = turn_half(turned)
     assert np.allclose(again.means, one.means) and np.allclose(again.rotations(), one.rotations(), atol=1e-6)
 
 

@@ -122,7 +122,7 @@ def test_a_scan_equals_the_same_cone_beam(variant_rgb, tmp_path: Path) -> None:
     (tmp_path / "nikon.toml").write_text(TOML + "solve = { iterations = 4 }\n")
     (tmp_path / "equal.toml").write_text(EQUAL)
     chosen = config.load(tmp_path / "nikon.toml")
-    assert projections.make_grid(chosen, tmp_path) == grid
+    assert projections.make_voxel_grid(chosen, tmp_path) == grid
     data = projections.make_data(chosen, tmp_path, grid)
     assert np.abs(data.y - exact).max() < 0.5 / 24000 + 1e-6
     for name in ("nikon", "equal"):
@@ -156,7 +156,7 @@ def test_angles_are_read_from_a_list(variant_rgb, tmp_path: Path, name: str) -> 
     (tmp_path / name).write_text(LISTS[name].format("\n".join(rows[::-1])))
     (tmp_path / "fit.toml").write_text(TOML)
     chosen = config.load(tmp_path / "fit.toml", [f'data.angles="{name}"'])
-    data = projections.make_data(chosen, tmp_path, projections.make_grid(chosen, tmp_path))
+    data = projections.make_data(chosen, tmp_path, projections.make_voxel_grid(chosen, tmp_path))
     np.testing.assert_allclose(data.geometry.angles, np.radians(angles - 180), atol=1e-14)
     assert data.notes[0] == "ignored settings: DetectorOffsetX = 2"
     # An even image has no axis.
@@ -201,7 +201,7 @@ def test_foreign_files_are_refused(variant_rgb, tmp_path: Path) -> None:
     path = write_scan(tmp_path, blank()[:, :-1], VoxelsX=0)
     (tmp_path / "fit.toml").write_text(TOML)
     chosen = config.load(tmp_path / "fit.toml")
-    assert_refused("give a table", projections.make_grid, chosen, tmp_path)
+    assert_refused("give a table", projections.make_voxel_grid, chosen, tmp_path)
     assert_refused("images of 9 x 12 pixels, expected 10 x 12", projections.make_data, chosen, tmp_path, VoxelGrid((2, 2, 2)))
     (tmp_path / "few.txt").write_text("1 0.0\n2 1.0\n")
     assert_refused("2 angles, expected one line for each of 16 views", read_nikon_angles, tmp_path / "few.txt", VIEWS)

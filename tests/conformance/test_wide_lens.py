@@ -26,7 +26,7 @@ from mivol.photos.dataset import to_pinhole
 from mivol.photos.lens import Fisheye, Panorama
 from mivol.photos.region import count_views, find_focus, silhouette_box
 from mivol.photos.transforms import write_transforms as write_cameras
-from mivol.report.cameras import outline
+from mivol.report.cameras import frustum_edges
 from mivol.scene.sensors import to_sensor
 from mivol.splatting.projection import pack_view
 
@@ -131,7 +131,7 @@ def test_films_of_wide_lenses_use_pinholes() -> None:
 
 def test_a_wide_camera_is_drawn_with_90_degrees() -> None:
     """Opposite edges: (1, 1, -1) and (-1, 1, -1) times the length are 2 apart."""
-    ends = outline(type("Frame", (), {"camera": panorama(pose=np.eye(4))}), 0.5)[:4, 1]
+    ends = frustum_edges(type("Frame", (), {"camera": panorama(pose=np.eye(4))}), 0.5)[:4, 1]
     np.testing.assert_allclose(np.abs(ends), 0.5)
     assert len({tuple(np.sign(end)) for end in ends}) == 4
 

@@ -128,7 +128,7 @@ def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path
     for text in (*shown, "view_3.png"):
         assert text in page
     rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
-    assert rows[-1]["iteration"] == record["results"]["iterations"] == field_fit.make_plan(config.load(path)).steps
+    assert rows[-1]["iteration"] == record["results"]["iterations"] == field_fit.make_radiance_plan(config.load(path)).steps
     assert all({"loss", "held_out_psnr"} <= row.keys() for row in rows)
 
 
@@ -211,12 +211,12 @@ def test_a_stopped_fit_goes_on(photographs: Path, tmp_path: Path, monkeypatch: p
 
 def test_what_the_file_says_overrides_the_preset(tmp_path: Path) -> None:
     raw = {"title": "x", "photos": {"path": "p"}}
-    assert field_fit.make_plan(config.from_dict(raw)) == PRESETS["cpu"]
+    assert field_fit.make_radiance_plan(config.from_dict(raw)) == PRESETS["cpu"]
     raw["field"] = {"preset": "cpu", "longest": 40, "degree": 1, "effort": 0.5, "tv_sh": 1e-3}
-    plan = field_fit.make_plan(config.from_dict(raw))
+    plan = field_fit.make_radiance_plan(config.from_dict(raw))
     assert [stage.longest for stage in plan.stages] == [32, 40]
     raw["field"]["longest"] = 200
-    assert [stage.longest for stage in field_fit.make_plan(config.from_dict(raw)).stages] == [32, 64, 128, 200]
+    assert [stage.longest for stage in field_fit.make_radiance_plan(config.from_dict(raw)).stages] == [32, 64, 128, 200]
     assert plan.stages[0].steps == round(PRESETS["cpu"].stages[0].steps / 2)
     assert (plan.degree, plan.tv_sh, plan.tv_density) == (1, 1e-3, PRESETS["cpu"].tv_density)
 
@@ -238,7 +238,7 @@ def test_what_is_taken_to_be_behind_is_said(photographs: Path, tmp_path: Path) -
     """The ball fills the middle of each view: its edges are white, whatever colour the file says is behind it."""
     chosen = config.load(toml(tmp_path, photographs), ["photos.background=[0, 0.5, 0]"])
     photos, _ = photo_data.read_photos(chosen, tmp_path)
-    plan = field_fit.make_plan(chosen)
+    plan = field_fit.make_radiance_plan(chosen)
     said = field_fit.explain_background(plan, photos)
     assert said.choice == "the colour (0, 0.5, 0) behind the box"
     assert "edges of the photographs is (1, 1, 1)" in said.reason
@@ -258,10 +258,10 @@ def test_what_is_behind_has_a_name(
     """A name says what is learned; a number of rows or of boxes that is given counts all the same."""
     named = [f'photos.background="{background}"']
     chosen = config.load(toml(tmp_path, photographs), [f"field.preset={preset}", *named])
-    plan = field_fit.make_plan(chosen)
+    plan = field_fit.make_radiance_plan(chosen)
     assert (plan.levels, plan.sky, plan.near > 0) == (levels, sky, levels > 1)
     given = config.load(toml(tmp_path, photographs), [f"field.preset={preset}", "field.sky=6", "field.levels=2", *named])
-    assert (field_fit.make_plan(given).levels, field_fit.make_plan(given).sky) == (2, 6)
+    assert (field_fit.make_radiance_plan(given).levels, field_fit.make_radiance_plan(given).sky) == (2, 6)
     colour = [1.0] * 3 if background == "white" else [0.0] * 3
     photos, judged = photo_data.read_photos(chosen, tmp_path)
     assert judged is not None
@@ -326,7 +326,7 @@ def test_stages_look_at_each_pixel_so_often_at_most(photos: Photos, photographs:
     # So many steps of the last stage look at each pixel least / 144 times.
     assert [stage.steps for stage in few.stages] == [least * count * 24**2 // (96 * 144), least]
     assert [stage.steps for stage in field_fit.adapt_plan(RadiancePlan(stages), photos).stages] == [10_000, 10_000, 5]
-    asked = field_fit.make_plan(config.load(toml(tmp_path, photographs), ["field.preset=fine", "field.effort=3"]))
+    asked = field_fit.make_radiance_plan(config.load(toml(tmp_path, photographs), ["field.preset=fine", "field.effort=3"]))
     assert asked.epochs == 3 * PRESETS["fine"].epochs < math.inf  # who asks for more gets more
     assert "each pixel is used at most 20 times" in field_fit.explain_steps(plan).reason
     assert field_fit.explain_steps(RadiancePlan(stages)).reason == "the preset's, times field.effort"
@@ -350,14 +350,14 @@ def test_a_long_box_has_as_many_nodes_as_a_cube(photos: Photos, photographs: Pat
     assert [stage.longest for stage in field_fit.adapt_plan(plan, far).stages] == [4, 8, 16]
     assert field_fit.adapt_plan(field_fit.adapt_plan(plan, long), long) == field_fit.adapt_plan(plan, long)
     assert [stage.longest for stage in field_fit.adapt_plan(replace(plan, cubic=False), long).stages] == [4, 8, 40]
-    assert not field_fit.make_plan(config.load(toml(tmp_path, photographs), ["field.longest=26"])).cubic
+    assert not field_fit.make_radiance_plan(config.load(toml(tmp_path, photographs), ["field.longest=26"])).cubic
 
 
 def test_few_photographs_are_smoothed_each_step(photographs: Path, tmp_path: Path) -> None:
     """Many are looked at every fourth step, where one move would be several learning rates of a few."""
     chosen = config.load(toml(tmp_path, photographs), ["field.preset=cpu"])
     photos, _ = photo_data.read_photos(chosen, tmp_path)
-    plan = field_fit.make_plan(chosen)
+    plan = field_fit.make_radiance_plan(chosen)
     assert plan.tv_every == 4 and len(photos.views) < FEW_PHOTOGRAPHS
     assert field_fit.adapt_plan(plan, photos).tv_every == 1
     many = replace(photos, views=photos.views * (FEW_PHOTOGRAPHS // len(photos.views) + 1))
@@ -370,7 +370,7 @@ def test_colours_of_few_photographs_do_not_decay(photos: Photos) -> None:
 
     def found(**field: float) -> list[tuple[float, int]]:
         raw = {"title": "x", "photos": {"path": "p"}, "field": {"preset": "capture", **field}}
-        plan = field_fit.make_plan(config.from_dict(raw))
+        plan = field_fit.make_radiance_plan(config.from_dict(raw))
         return [(one.matte, one.degree) for one in (field_fit.adapt_plan(plan, photos), field_fit.adapt_plan(plan, many))]
 
     assert found() == [(0, 1), (12, 2)]
@@ -391,7 +391,7 @@ def test_nested_boxes_are_those_that_points_and_cameras_need(photos: Photos, pho
     chosen = config.load(toml(tmp_path, photographs))
     half = (photos.box[1] - photos.box[0]) / 2
     points = photos.box.mean(axis=0) + half * np.concatenate([np.tile([0, 6, 0], (997, 1)), np.tile([0, 0, 9], (3, 1))])
-    plan = replace(field_fit.make_plan(chosen), levels=5, near=1.0)
+    plan = replace(field_fit.make_radiance_plan(chosen), levels=5, near=1.0)
     assert field_fit.adapt_plan(plan, photos).levels == 5
     stands = max(np.abs((view.camera.origin - photos.box.mean(axis=0)) / half).max() for view in photos.views)
     assert 2 < stands < 4
@@ -429,7 +429,7 @@ def test_nested_boxes_are_those_that_points_and_cameras_need(photos: Photos, pho
     one = said(points, replace(plan, levels=1, near=0.0, sky=8))
     assert "1000 of 1000 points" in one and "outside the box, in the sky" in one
     assert "nested" not in one and "nearer to a camera" not in one
-    told = field_fit.make_plan(config.load(toml(tmp_path, photographs), ["field.levels=2", "field.depth=0.5"]))
+    told = field_fit.make_radiance_plan(config.load(toml(tmp_path, photographs), ["field.levels=2", "field.depth=0.5"]))
     assert (told.levels, told.fewer_levels, told.depth) == (2, False, 0.5)
     assert_refused("field.levels = 13: expected `int` <= 12", config.load, toml(tmp_path, photographs), ["field.levels=13"])
 

@@ -23,7 +23,7 @@ from mivol.experiments.readings import ScanReadings, note_order, to_radians
 from mivol.experiments.scan_corrections import is_cut_off
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts
 from mivol.tomography.geometry import ConeBeam, ParallelBeam
-from mivol.tomography.panel_views import helix
+from mivol.tomography.panel_views import make_helix
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.preprocess import Air, Quanta, Transmission, assume_quantum_noise
 from mivol.tomography.rotation_axis import Axis
@@ -417,7 +417,7 @@ BEAM = ConeBeam(np.radians([0.0, 90.0, 360.0, 720.0]), (3, 5), 4.0, 6.0, 0.5, 0.
 
 def test_a_helix_rises_with_the_angle() -> None:
     """A lift of 2 a turn: over two turns the heights of source and detector are -2, -1.5, 0 and 2; nothing else moves."""
-    found, flat = helix(BEAM, 2.0).panels(), BEAM.panels()
+    found, flat = make_helix(BEAM, 2.0).panels(), BEAM.panels()
     rise = np.array([-2.0, -1.5, 0.0, 2.0])[:, None] * [0, 0, 1]
     np.testing.assert_allclose(found.source, flat.source + rise, atol=1e-12)
     np.testing.assert_allclose(found.corner, flat.corner + rise, atol=1e-12)
@@ -426,12 +426,12 @@ def test_a_helix_rises_with_the_angle() -> None:
 
 def test_sources_have_all_views_one_after_the_other() -> None:
     """Two sources: views 0 and 1 of the first, 2 and 3 of the second; shifted along the columns and z, the detector rests."""
-    found, flat = helix(BEAM, 0.0, [(0.5, 0.0), (-1.0, 2.0)]).panels(), BEAM.panels()
+    found, flat = make_helix(BEAM, 0.0, [(0.5, 0.0), (-1.0, 2.0)]).panels(), BEAM.panels()
     u = flat.along_u / 0.5
     np.testing.assert_allclose(found.source[:2], flat.source[:2] + 0.5 * u[:2], atol=1e-12)
     np.testing.assert_allclose(found.source[2:], flat.source[2:] - 1.0 * u[2:] + [0, 0, 2], atol=1e-12)
     np.testing.assert_allclose(found.corner, flat.corner, atol=1e-12)
-    assert_refused("found 4 views of 3 sources, expected as many views of each source", helix, BEAM, 0.0, [(0, 0)] * 3)
+    assert_refused("found 4 views of 3 sources, expected as many views of each source", make_helix, BEAM, 0.0, [(0, 0)] * 3)
 
 
 def test_settings_spread_the_views_of_each_source() -> None:

@@ -16,7 +16,7 @@ from refusals import assert_refused
 from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments.field_fit import adapt_plan, make_batches, make_plan, write_result
+from mivol.experiments.field_fit import adapt_plan, make_batches, make_radiance_plan, write_result
 from mivol.experiments.photo_data import MIDDLE_GREY, describe_photos, divide_by_white, read_photos
 from mivol.experiments.photo_fit import judge_colour_fitted, write_view
 from mivol.fields.field_files import read_field
@@ -104,7 +104,7 @@ def test_what_is_found_is_kept_in_the_unit_of_the_files(photographs: Path, tmp_p
     """The field and its sky are brightened; a view beside its photograph is tone-mapped."""
     path = toml(tmp_path, photographs, field="sky = 8")
     photos, judged = read(path)
-    plan = adapt_plan(make_plan(config.load(path)), photos)
+    plan = adapt_plan(make_radiance_plan(config.load(path)), photos)
     problem = RadianceProblem(make_batches(plan, photos), photos.box, plan)
     problem.sky = Sky.uniform(8, 0.75)
     write_result(tmp_path, problem, "_best", photos.white)

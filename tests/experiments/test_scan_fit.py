@@ -20,7 +20,7 @@ from mivol.errors import MivolError
 from mivol.experiments import kinds, projections, readings, scan_fit
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.scan_fit import make_problem, write_outputs
-from mivol.experiments.solver_choice import Storage, choose_storage
+from mivol.experiments.solver_choice import Storage, choose_matrix_storage
 from mivol.files import read_exr, read_volume, write_volume
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import shepp_logan
@@ -159,7 +159,7 @@ def test_an_interrupted_scan_is_resumed(variant_rgb, folder: Path, monkeypatch: 
     changes = ["data.photons=1e4", f"solve.name={case.split()[0]}", *RESUMED[case]]
     if "drifts" in case or "gains" in case:
         chosen = config.load(folder / "fit.toml", changes[:1])
-        data = projections.make_data(chosen, folder, projections.make_grid(chosen, folder))
+        data = projections.make_data(chosen, folder, projections.make_voxel_grid(chosen, folder))
         np.save(folder / "y.npy", data.y + np.linspace(0, 0.1, 18)[:, None, None] * np.linspace(-1, 1, 14))
         changes = changes[1:]
     monkeypatch.setattr(kinds, "write_page", lambda folder: folder)
@@ -226,7 +226,7 @@ def test_a_finished_run_continues_from_its_volume(
         monkeypatch.setattr(scan_fit, picture, lambda *arguments: [])
     if "gains" in case:
         chosen = config.load(folder / "fit.toml")
-        data = projections.make_data(chosen, folder, projections.make_grid(chosen, folder))
+        data = projections.make_data(chosen, folder, projections.make_voxel_grid(chosen, folder))
         np.save(folder / "y.npy", data.y + 0.1 * np.sin(np.arange(14)))
     assert run(folder, "solve.iterations=4", *changes) == 0
     volume = read_volume(folder / "run/volumes/reconstruction.npz").values
@@ -350,8 +350,8 @@ PARALLEL = 'scan={beam="parallel", views=12, detector=[12, 14], pitch=0.2}'
 def storage_of(folder: Path, rows: int = 12, **settings: object) -> Storage:
     parallel = PARALLEL.replace("[12, 14]", f"[{rows}, 14]")
     chosen = config.load(folder / "fit.toml", [parallel, *(f"solve.{name}={value}" for name, value in settings.items())])
-    grid = projections.make_grid(chosen, folder)
-    return choose_storage(chosen.solve, Projector(projections.make_geometry(chosen, folder), grid))
+    grid = projections.make_voxel_grid(chosen, folder)
+    return choose_matrix_storage(chosen.solve, Projector(projections.make_geometry(chosen, folder), grid))
 
 
 def test_rows_are_stored_where_they_fit_and_pay(variant_rgb, folder: Path) -> None:
@@ -465,7 +465,7 @@ def test_readings_are_fitted_as_counts(variant_rgb, folder: Path) -> None:
     for a sixth of the rays that are missing, and less than the three quarters that every solver is held to.
     """
     chosen = config.load(folder / "fit.toml", ["data.photons=5000"])
-    grid = projections.make_grid(chosen, folder)
+    grid = projections.make_voxel_grid(chosen, folder)
     data = projections.make_data(chosen, folder, grid)
     readings = 64.0 + 20 * data.quanta.counts
     readings[np.random.default_rng(0).random(readings.shape) < 0.1] = 2e5
@@ -617,7 +617,7 @@ def test_resume_refuses_other_projections(variant_rgb, folder: Path, capsys: pyt
 def test_a_scan_is_read_as_one(folder: Path) -> None:
     found = config.load(folder / "fit.toml")
     assert isinstance(found, config.ScanExperiment)
-    assert config.from_dict(config.resolved(found)) == found
+    assert config.from_dict(config.list_all_settings(found)) == found
     with pytest.raises(MivolError, match="missing: give it"):
         config.from_dict({"title": "x", "scan": {"beam": "parallel"}, "grid": {"shape": [1, 2, 3]}})
 

@@ -16,7 +16,7 @@ from mivol.optim.first_order import Adam
 from mivol.optim.loop import Course, begin_fit
 from mivol.optim.parameters import Parameter
 from mivol.optim.priors import PRIORS
-from mivol.optim.scenes.brick_stages import _carry, _find_asked, _find_kept, neighbours_of
+from mivol.optim.scenes.brick_stages import _carry, _find_asked, _find_kept, find_neighbours
 from mivol.optim.scenes.scene_problem import SceneProblem
 
 SHAPE = (32, 24, 24)
@@ -78,8 +78,8 @@ def test_neighbours_and_rows() -> None:
     counts = (3, 4, 5)
     middle = np.ravel_multi_index((1, 2, 2), counts)
     around = [np.ravel_multi_index((1 + a, 2 + b, 2 + c), counts) for a, b, c in itertools.product((-1, 0, 1), repeat=3)]
-    assert neighbours_of(np.array([middle]), counts).tolist() == sorted(around)
-    assert len(neighbours_of(np.array([0]), counts)) == 8
+    assert find_neighbours(np.array([middle]), counts).tolist() == sorted(around)
+    assert len(find_neighbours(np.array([0]), counts)) == 8
     values = np.array([0.0, 0.5, 0.2])[:, None] * np.ones((1, 4))
     assert _find_kept(values, np.array([3, 5, 9]), 0.2).tolist() == [5]
     assert _find_kept(values, np.array([3, 5, 9]), 0.7).tolist() == [5]

@@ -14,7 +14,7 @@ from ball_photos import BOX, PLAN, draw_tiles
 
 from mivol import config
 from mivol.errors import MivolError
-from mivol.experiments.field_fit import GAINS, explain_plan, make_plan
+from mivol.experiments.field_fit import GAINS, explain_plan, make_radiance_plan
 from mivol.experiments.photo_fit import tabulate_gains
 from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.loop import begin_fit
@@ -127,7 +127,9 @@ def test_gains_need_cameras(variant_rgb: str, photos: list[Photo]) -> None:
 
 def test_preset_or_file_sets_gains() -> None:
     def plan(preset: str, **settings: object) -> RadiancePlan:
-        return make_plan(config.from_dict({"title": "x", "photos": {"path": "x"}, "field": {"preset": preset, **settings}}))
+        return make_radiance_plan(
+            config.from_dict({"title": "x", "photos": {"path": "x"}, "field": {"preset": preset, **settings}})
+        )
 
     assert plan("capture").exposure and not plan("cpu").exposure
     assert plan("cpu", exposure=True).exposure and not plan("capture", exposure=False).exposure

@@ -19,11 +19,11 @@ from mivol.optim.parameters import (
     SHARE,
     Parameter,
     as_tensor,
-    find,
+    find_key,
     find_parameter_kind,
     inverse_softplus,
-    like,
     softplus,
+    to_type_of,
 )
 from mivol.optim.strategy import suggest_name
 
@@ -70,7 +70,7 @@ def test_projection_is_the_nearest_point_of_the_domain(variant_rgb, name: str) -
 
 def test_scene_values_convert_to_tensors_and_back(variant_rgb) -> None:
     for value in (mi.Float(1.5), mi.Color3f(1, 2, 3), mi.TensorXf(np.ones((1, 2, 3, 1), "f"))):
-        again = like(as_tensor(value), value)
+        again = to_type_of(as_tensor(value), value)
         assert type(again) is type(value)
         assert np.array_equal(np.asarray(again), np.asarray(value))
 
@@ -103,19 +103,19 @@ def test_refused_starts(variant_rgb) -> None:
 
 def test_find_offers_the_nearest_key(variant_rgb) -> None:
     params = mi.traverse(absorbing_scene(np.ones((2, 2, 2, 1))))
-    assert find(KEY, params) == KEY
-    assert_refused(f'did you mean "{KEY}"', find, "cube.interior_medium.sigma_t.dat", params)
+    assert find_key(KEY, params) == KEY
+    assert_refused(f'did you mean "{KEY}"', find_key, "cube.interior_medium.sigma_t.dat", params)
     emitter = mi.traverse(mi.load_dict({"type": "scene", "emitter": {"type": "spot"}}))
-    assert_refused("AffineTransform4f, expected a number", find, "emitter.to_world", emitter)
+    assert_refused("AffineTransform4f, expected a number", find_key, "emitter.to_world", emitter)
 
 
 def test_an_object_without_an_id_is_asked_for_one(variant_rgb) -> None:
     """Mitsuba names it by its address, so a key of one run says nothing in the next."""
     nameless = mi.traverse(mi.load_string('<scene version="3.0.0"><shape type="sphere"><emitter type="area"/></shape></scene>'))
     with pytest.raises(MivolError, match='did you mean "<id>.emitter.radiance.value": give the objects .* an id in the scene'):
-        find("shape_1.emitter.radiance.value", nameless)
+        find_key("shape_1.emitter.radiance.value", nameless)
     for key in (next(key for key in list(nameless.keys()) if key.startswith("object_")), "object_123.emitter.radiance.value"):
-        assert_refused("memory address", find, key, nameless)
+        assert_refused("memory address", find_key, key, nameless)
 
 
 @pytest.mark.parametrize(

@@ -31,8 +31,8 @@ from mivol.report.cameras import (
     PARTS,
     WIDTH,
     draw_scanner,
+    frustum_edges,
     list_parts,
-    outline,
     plot_cameras,
     plot_scanner,
     select_views,
@@ -121,7 +121,7 @@ def test_edges_of_a_view_go_through_the_corners_of_its_film() -> None:
     pose = np.eye(4)
     pose[:3, 3] = 1, 2, 3
     camera = Camera(np.array([[20.0, 0, 7], [0, 10, 3], [0, 0, 1]]), (12, 8), pose)
-    edges = outline(PhotoFrame(Path("a.png"), camera, "train"), 2.0)
+    edges = frustum_edges(PhotoFrame(Path("a.png"), camera, "train"), 2.0)
     corners = np.array([1, 2, 3]) + 2 * np.array([[-0.35, 0.3, -1], [0.25, 0.3, -1], [0.25, -0.5, -1], [-0.35, -0.5, -1]])
     np.testing.assert_allclose(edges[:4], np.stack([np.tile([1.0, 2, 3], (4, 1)), corners], axis=1))
     np.testing.assert_allclose(edges[4:], np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))
@@ -134,7 +134,7 @@ def test_views_are_drawn_as_long_as_the_cameras_are_far(survey: PhotoSurvey) -> 
     length = EDGE * np.median([np.linalg.norm(frame.camera.origin - middle) for frame in survey.frames])
     first = next(frame for frame in survey.frames if frame.split == "train")
     own = np.array(plan.lines[0].get_data()).T.reshape(-1, 8, 3, 2)[0]
-    np.testing.assert_allclose(own[:, :2], outline(first, length)[:, :, :2])
+    np.testing.assert_allclose(own[:, :2], frustum_edges(first, length)[:, :, :2])
 
 
 @pytest.mark.parametrize(("many", "shown"), [(MOST_POINTS - 1, MOST_POINTS - 1), (3 * MOST_POINTS, MOST_POINTS)])

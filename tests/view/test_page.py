@@ -146,7 +146,7 @@ def make_page(monkeypatch: pytest.MonkeyPatch, output: Path | None, survey: obje
     )  # fmt: skip
     monkeypatch.setattr(module, "check_viser", lambda: None)
     monkeypatch.setattr(module, "start_server", lambda port, token: Server())
-    monkeypatch.setattr(module, "quiet", nullcontext)
+    monkeypatch.setattr(module, "silence_viser", nullcontext)
     monkeypatch.setattr(module, "Painter", FlatPainter)
     return Page(subject, output)
 

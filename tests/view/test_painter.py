@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mivol.photos import Camera, intrinsics
-from mivol.view.painter import EDGES, LONGEST, PASSES, REST, Inbox, Painter, scale_camera, strip, to_picture
+from mivol.view.painter import EDGES, LONGEST, PASSES, REST, Inbox, Painter, crop_rows, scale_camera, to_picture
 from mivol.view.subjects import Look, Subject
 
 SIZE = 1200, 900
@@ -150,7 +150,7 @@ def test_exposure_doubles_radiance() -> None:
 
 
 def test_a_strip_sees_the_rows_of_the_image() -> None:
-    part = strip(camera(), 100, 50)
+    part = crop_rows(camera(), 100, 50)
     assert part.size == (1200, 50) and part.K[1, 2] == camera().K[1, 2] - 100
 
 

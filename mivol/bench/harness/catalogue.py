@@ -146,13 +146,13 @@ def read_result(path: Path) -> dict:
 
 def find_changes(before: dict, now: dict) -> list[str]:
     """List the numbers in both results that differ by ``NOTABLE`` or more, the largest change first."""
-    old, new = dict(numbers_in(before)), dict(numbers_in(now))
+    old, new = dict(list_numbers(before)), dict(list_numbers(now))
     ratios = {key: new[key] / old[key] for key in new if key in old and old[key] * new[key] > 0}
     notable = sorted((key for key, r in ratios.items() if abs(r - 1) >= NOTABLE), key=lambda key: -abs(math.log(ratios[key])))
     return [f"{key}: {old[key]:.4g} -> {new[key]:.4g} (x {ratios[key]:.3g})" for key in notable]
 
 
-def numbers_in(tree: object, prefix: str = "") -> list[tuple[str, float]]:
+def list_numbers(tree: object, prefix: str = "") -> list[tuple[str, float]]:
     """All numbers of a result by dotted key, without the numbers of the machine and the run."""
     if isinstance(tree, bool):
         return []
@@ -160,4 +160,4 @@ def numbers_in(tree: object, prefix: str = "") -> list[tuple[str, float]]:
         return [(prefix, float(tree))]
     items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
     skipped = ("machine", "versions", "date", "threads", "load_before_and_after", "seconds", "bars") if not prefix else ()
-    return [pair for key, value in items if key not in skipped for pair in numbers_in(value, f"{prefix}.{key}".lstrip("."))]
+    return [pair for key, value in items if key not in skipped for pair in list_numbers(value, f"{prefix}.{key}".lstrip("."))]

@@ -53,7 +53,7 @@ __all__ = [
     "mean_of_rounds",
     "peak_bytes",
     "race",
-    "ratio_of",
+    "time_ratio",
     "render_method",
     "time_call",
 ]
@@ -167,7 +167,7 @@ def time_first_call(call: Contestant) -> dict[str, float]:
     }
 
 
-def ratio_of(slow: Timing, fast: Timing, clock: str = "seconds") -> float:
+def time_ratio(slow: Timing, fast: Timing, clock: str = "seconds") -> float:
     """Time of one contestant over the time of another: median over the rounds, by ``seconds`` or by ``processor``."""
     return float(np.median(np.array(getattr(slow, clock)) / np.array(getattr(fast, clock))))
 
@@ -322,7 +322,7 @@ class Contest:
     def time_ratios(self, slow: str, fast: str) -> dict[str, float]:
         """Time of one method over the time of another, by the wall clock and by processor time."""
         pair = self.timings[slow, 1], self.timings[fast, 1]
-        return {"time": ratio_of(*pair), "processor_time": ratio_of(*pair, "processor")}
+        return {"time": time_ratio(*pair), "processor_time": time_ratio(*pair, "processor")}
 
 
 def compete(

@@ -27,7 +27,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from mivol.bench.harness.contests import Contestant, peak_bytes, race, ratio_of, time_call
+from mivol.bench.harness.contests import Contestant, peak_bytes, race, time_call, time_ratio
 from mivol.bench.harness.study import AT_LEAST, AT_MOST, Promise, Size, Study, amount
 from mivol.bench.scenes import (
     TO_WORLD,
@@ -171,7 +171,7 @@ def race_reverse(rays: GridRays, rounds: int) -> dict:
         "gradient step of drjit.dda.integrate": lambda _: gradient_step(padded, lambda v: integrate_by_drjit(rays, v)),
     }
     timings = race(contestants, rounds)
-    ratios = {f"{name} over forward": ratio_of(t, timings["forward"]) for name, t in timings.items() if name != "forward"}
+    ratios = {f"{name} over forward": time_ratio(t, timings["forward"]) for name, t in timings.items() if name != "forward"}
     return ratios | {name: t.report(rays.n, "rays") for name, t in timings.items()}
 
 
@@ -201,7 +201,7 @@ def race_gradient_of_render(size: OpticalDepthSize) -> dict:
 
     timings = race({"render": render, "gradient step": step}, size.rounds)
     reports = {name: t.report(size.image_side**2 * size.image_spp, "paths") for name, t in timings.items()}
-    return {"gradient step over render": ratio_of(timings["gradient step"], timings["render"])} | reports
+    return {"gradient step over render": time_ratio(timings["gradient step"], timings["render"])} | reports
 
 
 def measure_memory(size: OpticalDepthSize) -> dict:
@@ -250,7 +250,7 @@ def measure_image(size: OpticalDepthSize) -> dict:
         errors = [image[..., 0].ravel()[pixels] - exact for image in timing.results]
         answer[name] = timing.report(size.image_side**2 * size.image_spp, "paths") | {"rms_error": rms(errors)}
         if name != "mivol":
-            faster = ratio_of(timing, timings["mivol"])
+            faster = time_ratio(timing, timings["mivol"])
             variance = (answer[name]["rms_error"] / answer["mivol"]["rms_error"]) ** 2
             answer[name] |= {"mivol_is_faster": faster, "mivol_is_faster_at_equal_error": faster * variance}
     return answer

@@ -33,7 +33,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.harness.contests import Contestant, Timing, race, ratio_of
+from mivol.bench.harness.contests import Contestant, Timing, race, time_ratio
 from mivol.bench.harness.figures import new_figure, show_images
 from mivol.bench.harness.study import AT_LEAST, AT_MOST, Promise, Size, Study, amount, ask, say_row
 from mivol.bench.photo_fits import find_data, fit_photographs, prepare_fit
@@ -215,8 +215,8 @@ def report_scaled(timing: Timing, pixels: int, walk: Timing, size: PointsSize) -
     """Times and rates, with the rates of the reference machine by wall clock and by processor time."""
     scale = pixels * REFERENCE_RATE / size.walk_side**2
     return timing.report(pixels, "pixels") | {
-        "pixels_per_second_scaled": scale / ratio_of(timing, walk),
-        "pixels_per_second_scaled_by_processor": scale / ratio_of(timing, walk, "processor"),
+        "pixels_per_second_scaled": scale / time_ratio(timing, walk),
+        "pixels_per_second_scaled_by_processor": scale / time_ratio(timing, walk, "processor"),
     }
 
 
@@ -244,7 +244,7 @@ def measure_peer(size: PointsSize) -> dict:
         "forward and backward": {name: t.report(side**2, "pixels") for name, t in both.items()},
         "forward": {name: t.report(side**2, "pixels") for name, t in forward.items()},
         **speed_over_peer(both),
-        "mivol_is_faster_forward": ratio_of(forward["volprim_rf_basic"], forward["mivol"]),
+        "mivol_is_faster_forward": time_ratio(forward["volprim_rf_basic"], forward["mivol"]),
         **compare_pictures(pictures),
         "mean_difference": float(np.mean(pictures[0] - pictures[1])),
         "pictures": pictures,
@@ -264,7 +264,7 @@ def compare_pictures(pictures: np.ndarray) -> dict[str, float]:
 def speed_over_peer(timings: dict[str, Timing]) -> dict[str, float]:
     """Time of the peer over the time of mivol, by wall clock and by processor time."""
     pair = timings["volprim_rf_basic"], timings["mivol"]
-    return {"mivol_is_faster": ratio_of(*pair), "mivol_is_faster_by_processor": ratio_of(*pair, "processor")}
+    return {"mivol_is_faster": time_ratio(*pair), "mivol_is_faster_by_processor": time_ratio(*pair, "processor")}
 
 
 def measure_rays(size: PointsSize) -> dict:

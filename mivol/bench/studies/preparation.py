@@ -35,7 +35,7 @@ from mivol.experiments.scan_fit import start_volume
 from mivol.experiments.solver_choice import (
     GAIN_ITERATIONS,
     ITERATIONS,
-    choose_storage,
+    choose_matrix_storage,
     estimate_noise,
     make_prior,
     resolve_solver,
@@ -122,7 +122,7 @@ def solve_by_default(y: np.ndarray, weights: np.ndarray, is_noise_known: bool, w
     iterations = GAIN_ITERATIONS if with_gains else ITERATIONS
     solve, _ = resolve_solver(config.SolveSettings(), Projector(BEAM, GRID), iterations)
     walk = Projector(BEAM, subdivide_grid(GRID, solve.supersampling, BEAM))
-    walk = choose_storage(solve, walk).apply(walk)
+    walk = choose_matrix_storage(solve, walk).apply(walk)
     data, views = Projections(BEAM, y, weights, is_noise_known=is_noise_known), np.arange(VIEWS)
     start, prior = start_volume(solve, walk, data, views), make_prior(solve, walk, data, views)
     gains = PixelGains(weights) if with_gains else None

@@ -25,7 +25,7 @@ import numpy as np
 from drjit.hashgrid import HashGridEncoding
 from matplotlib.ticker import MaxNLocator
 
-from mivol.bench.harness.contests import Stopwatch, race, ratio_of
+from mivol.bench.harness.contests import Stopwatch, race, time_ratio
 from mivol.bench.harness.figures import new_figure, show_images
 from mivol.bench.harness.study import AT_LEAST, AT_MOST, Promise, Study, amount, ask, say_row
 from mivol.bench.photo_fits import FittedProblem, PhotoSize, find_photographs, fit_photographs, prepare_fit, prepare_fit_in_time
@@ -239,7 +239,7 @@ def measure_sample_rates(size: RepresentationSize) -> dict:
     rates = {name: count / float(np.median(timing.processor)) for name, timing in timings.items()}
     for name, rate in rates.items():
         say_row(name, samples_per_processor_second=rate, on_2_cores=2 * rate)
-    return {"rates": rates, "ratio": ratio_of(timings["drjit.hashgrid"], timings["mivol"], "processor")}
+    return {"rates": rates, "ratio": time_ratio(timings["drjit.hashgrid"], timings["mivol"], "processor")}
 
 
 def measure_octree(size: RepresentationSize) -> dict:

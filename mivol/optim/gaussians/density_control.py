@@ -55,7 +55,7 @@ class CloudChange:
         return CloudChange(later.cloud, self.parent[later.parent], self.forgets[later.parent] | later.forgets)
 
 
-def unchanged(cloud: CloudArrays) -> CloudChange:
+def keep_cloud(cloud: CloudArrays) -> CloudChange:
     """A change without effect on the cloud."""
     n = len(cloud["means"])
     return CloudChange(cloud, np.arange(n), np.zeros(n, bool))
@@ -123,7 +123,7 @@ def relocate(cloud: CloudArrays, unused_below: float, rng: np.random.Generator) 
     opacity = expit(cloud["opacity_logits"].astype(np.float64))
     unused, used = np.flatnonzero(opacity < unused_below), np.flatnonzero(opacity >= unused_below)
     if len(unused) == 0 or len(used) == 0:
-        return unchanged(cloud)
+        return keep_cloud(cloud)
     source = rng.choice(used, len(unused), p=opacity[used] / opacity[used].sum())
     parent = np.arange(len(opacity))
     parent[unused] = source

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from mivol.optim.projections.iterative import golden_order
-from mivol.optim.projections.linear_problems import reciprocal
+from mivol.optim.projections.linear_problems import invert_sums
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector
 
@@ -137,7 +137,7 @@ class DiskSweeps:
         for some in self._batches(views):
             r = np.nan_to_num(self._open("residual")[some], nan=0.0)
             square += float(np.sum(r * r, dtype=np.float64))
-            self._open("residual", "r+")[some] = r * reciprocal(self._box.subset(some).row_sums, longest)
+            self._open("residual", "r+")[some] = r * invert_sums(self._box.subset(some).row_sums, longest)
         return square
 
     def _update(self, layers: slice, s: int, views: np.ndarray, strength: np.float32, state: SweepState) -> None:
@@ -145,7 +145,7 @@ class DiskSweeps:
         total = np.zeros(a.grid.shape, np.float32)
         for some in self._batches(views):
             total += a.subset(some).T @ self._open("residual")[some, rows]
-        change = total[inner] * reciprocal(self._open("sums")[s, layers], state.largest[s]) * strength
+        change = total[inner] * invert_sums(self._open("sums")[s, layers], state.largest[s]) * strength
         x = self.volume(state)[layers] + change
         self._open(f"volume_{(state.steps + 1) % 2}", "r+")[layers] = np.maximum(x, 0) if self.nonnegative else x
 

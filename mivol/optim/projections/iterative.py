@@ -26,9 +26,9 @@ from mivol.optim.projections.linear_problems import (
     dot,
     flat_weights,
     flatten,
+    invert_sums,
     map_blocks,
     ray_lengths,
-    reciprocal,
     start_field,
     weighting,
 )
@@ -132,8 +132,8 @@ def _block(problem: LeastSquares, views: np.ndarray | None, chord: np.ndarray) -
         return rays if views is None else rays.reshape(problem.A.n_views, -1)[views].reshape(-1)
 
     used = np.ones(a.shape[0], a.dtype) if problem.weights is None else (part(problem.weights) > 0).astype(a.dtype)
-    per_ray = used * reciprocal(part(chord))
-    return _Block(a, part(problem.b), used, per_ray, reciprocal(a.T @ used))
+    per_ray = used * invert_sums(part(chord))
+    return _Block(a, part(problem.b), used, per_ray, invert_sums(a.T @ used))
 
 
 def golden_order(n: int) -> np.ndarray:
@@ -375,7 +375,7 @@ def transmission_likelihood(problem: PoissonCounts, state: SolverState | None = 
         bound = a.T @ (counts.optimum_curvature(line) * chord).astype(a.dtype)
         if prior:
             bound = prior.add_derivatives(x, gradient, bound)
-        x = np.maximum(x - gradient * reciprocal(bound), 0)
+        x = np.maximum(x - gradient * invert_sums(bound), 0)
         state = counts.state(x, state.iteration + 1, a @ x)
         yield state
 

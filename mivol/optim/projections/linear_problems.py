@@ -172,7 +172,7 @@ GRAZED = 1e-6
 """Sum of a ray's or a voxel's entries, over the largest sum, up to which it is only grazed and stays unchanged."""
 
 
-def reciprocal(v: np.ndarray, largest: float | None = None) -> np.ndarray:
+def invert_sums(v: np.ndarray, largest: float | None = None) -> np.ndarray:
     """1 / v; 0 for v of grazed rays and voxels. ``largest``: the largest sum, if v is a part of all sums."""
     floor = GRAZED * (float(np.max(v, initial=0.0)) if largest is None else largest)
     return np.where(v > floor, 1.0 / np.where(v > floor, v, 1.0), 0.0).astype(v.dtype)

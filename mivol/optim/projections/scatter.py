@@ -33,7 +33,7 @@ from scipy.sparse.linalg import LinearOperator, lsqr
 from mivol.errors import MivolError
 from mivol.tomography.filtered import feldkamp, filtered_backprojection
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
-from mivol.tomography.preprocess import interpolate_gaps, subtract_light
+from mivol.tomography.preprocess import interpolate_gaps, subtract_scatter
 from mivol.tomography.projector import Projector
 from mivol.tomography.stored import matrix_bytes, store_matrix
 
@@ -84,7 +84,7 @@ class Scatter:
 
     def subtract(self, y: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Line integrals of the light that was not scattered, and their weights; 0 at pixels darker than the scatter."""
-        lines, weights = subtract_light(y, weights, self.light)
+        lines, weights = subtract_scatter(y, weights, self.light)
         return np.where(weights > 0, lines + np.log(1 - self.air), 0.0), weights
 
 

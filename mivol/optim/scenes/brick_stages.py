@@ -20,7 +20,7 @@ from mivol.errors import MivolError
 from mivol.optim.parameters import Parameter
 from mivol.optim.problem import Reals, Refinement
 
-__all__ = ["BrickProblem", "adapt_bricks", "bricks_key", "check_sparse_parameter", "neighbours_of"]
+__all__ = ["BrickProblem", "adapt_bricks", "bricks_key", "check_sparse_parameter", "find_neighbours"]
 
 
 class BrickProblem(Protocol):
@@ -88,7 +88,7 @@ def adapt_bricks(problem: BrickProblem, reals: Reals, iteration: int, threshold:
         raise MivolError("the event 'adapt_bricks' found no sparse grid among the parameters: remove the event.")
     before = {name: problem.brick_numbers(name) for name in counts}
     kept = {name: _find_kept(np.array(reals[name]), before[name], threshold) for name in counts}
-    tried = {name: np.union1d(kept[name], neighbours_of(kept[name], counts[name])) for name in counts}
+    tried = {name: np.union1d(kept[name], find_neighbours(kept[name], counts[name])) for name in counts}
     trial = dict(reals)
     for name, numbers in tried.items():
         problem.set_brick_numbers(name, numbers)
@@ -108,7 +108,7 @@ def adapt_bricks(problem: BrickProblem, reals: Reals, iteration: int, threshold:
     return Refinement(carry(reals), carry, message=", ".join(messages))
 
 
-def neighbours_of(numbers: np.ndarray, counts: tuple[int, int, int]) -> np.ndarray:
+def find_neighbours(numbers: np.ndarray, counts: tuple[int, int, int]) -> np.ndarray:
     """The numbers of the 26 neighbours of bricks in a box of (Z, Y, X) bricks, ascending; bricks among them too."""
     places = np.stack(np.unravel_index(numbers, counts), axis=1)
     around = (places[:, None] + np.array(list(itertools.product((-1, 0, 1), repeat=3)))).reshape(-1, 3)

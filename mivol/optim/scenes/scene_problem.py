@@ -25,7 +25,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.optim.losses import L2, FunctionLoss, Loss, to_loss
-from mivol.optim.parameters import Parameter, as_tensor, check_names, find, like
+from mivol.optim.parameters import Parameter, as_tensor, check_names, find_key, to_type_of
 from mivol.optim.problem import LinearizableProblem, Reals, Refinement
 from mivol.optim.scenes.brick_stages import adapt_bricks, bricks_key, check_sparse_parameter
 from mivol.optim.scenes.render_noise import (
@@ -93,7 +93,7 @@ class SceneProblem(LinearizableProblem):
         self.integrator = self.integrator or self.scene.integrator()
         self.params = traverse(self.scene)
         for parameter in self.parameters:
-            find(parameter.name, self.params)
+            find_key(parameter.name, self.params)
         check_names([parameter.name for parameter in self.parameters])
         names = [parameter.name for parameter in self.parameters]
         self.sparse = [name for name in names if bricks_key(name) in self.params.keys()]  # noqa: SIM118
@@ -147,7 +147,7 @@ class SceneProblem(LinearizableProblem):
     def set_reals(self, reals: Reals) -> None:
         """Set the scene's values to x(u), ready to receive gradients."""
         for p in self.parameters:
-            value = like(dr.detach(p.from_reals(reals[p.name])), self.params[p.name])
+            value = to_type_of(dr.detach(p.from_reals(reals[p.name])), self.params[p.name])
             dr.make_opaque(value)
             dr.enable_grad(value)
             self.params[p.name] = value
@@ -237,7 +237,7 @@ class SceneProblem(LinearizableProblem):
         """Set the tangents, before each render: some integrators consume tangents."""
         for p in self.parameters:
             value = self.params[p.name]
-            dr.set_grad(value, like(tangents[p.name], value))
+            dr.set_grad(value, to_type_of(tangents[p.name], value))
 
     def _finish(self, arrays: object, samples: int) -> None:
         """Launch the kernels of a pass; wait for a large pass, since an interrupt acts between passes."""

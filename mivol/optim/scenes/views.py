@@ -74,7 +74,7 @@ def check_views(views: Sequence[View]) -> None:
     """
     if not views:
         raise MivolError("found no views to fit: give at least one sensor with a reference.")
-    check_sizes({view.name: view.sensor for view in views})
+    check_image_sizes({view.name: view.sensor for view in views})
     for view in views:
         width, height = (int(n) for n in view.sensor.film().crop_size())
         if view.reference.ndim != 3 or tuple(view.reference.shape[:2]) != (height, width):
@@ -96,7 +96,7 @@ def remove_alpha(view: View) -> View:
     return replace(view, reference=drop_alpha(view.reference, view.sensor)) if alpha else view
 
 
-def check_sizes(sensors: Mapping[str, mi.Sensor]) -> None:
+def check_image_sizes(sensors: Mapping[str, mi.Sensor]) -> None:
     """Check for equal image sizes of sensors, by name.
 
     Raises:

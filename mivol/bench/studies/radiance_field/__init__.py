@@ -36,7 +36,7 @@ import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 
-from mivol.bench.harness.contests import Stopwatch, race, ratio_of
+from mivol.bench.harness.contests import Stopwatch, race, time_ratio
 from mivol.bench.harness.figures import new_figure, plot_errors, plot_ratios
 from mivol.bench.harness.study import AT_LEAST, AT_MOST, Promise, Study, amount, say_row
 from mivol.bench.photo_fits import PhotoSize, find_photographs, fit_photographs, prepare_fit
@@ -197,8 +197,8 @@ def measure_step(size: RadianceSize) -> dict:
         for kind, task in make_tasks(size).items():
             times = race({"mivol": mivol_step(field, task), "peer": peer_step(peer, task)}, size.rounds)
             answer[name][kind] = {
-                "ratio_of_processor_time": ratio_of(times["peer"], times["mivol"], "processor"),
-                "ratio_of_time": ratio_of(times["peer"], times["mivol"]),
+                "ratio_of_processor_time": time_ratio(times["peer"], times["mivol"], "processor"),
+                "ratio_of_time": time_ratio(times["peer"], times["mivol"]),
                 **{who: t.report(size.side**2, "rays") for who, t in times.items()},
             }
     return answer

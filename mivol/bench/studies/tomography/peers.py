@@ -31,9 +31,9 @@ from scipy.ndimage import shift
 from mivol import config
 from mivol.bench.harness.study import say
 from mivol.experiments.examples import examples_folder
-from mivol.experiments.projections import Projections, fitted_views, held_out_views, make_data, make_grid
+from mivol.experiments.projections import Projections, fitted_views, held_out_views, make_data, make_voxel_grid
 from mivol.experiments.scan_fit import start_volume
-from mivol.experiments.solver_choice import choose_storage, estimate_noise, make_prior, resolve_solver
+from mivol.experiments.solver_choice import choose_matrix_storage, estimate_noise, make_prior, resolve_solver
 from mivol.optim.projections.inversion import ALL_SOLVERS, ProjectionProblem
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts
 from mivol.tomography.filtered import filtered_backprojection
@@ -126,7 +126,7 @@ def load_tooth() -> MeasuredSlice:
     path = examples_folder() / "tooth" / "fit.toml"
     chosen = config.load(path)
     edge = chosen.grid.shape[1] // 2 * 2 + 1
-    data = make_data(chosen, path.parent, make_grid(chosen, path.parent))
+    data = make_data(chosen, path.parent, make_voxel_grid(chosen, path.parent))
     beam = data.geometry
     column = beam.axis_offset / np.broadcast_to(beam.pitch, 2)[1] + (beam.detector[1] - 1) / 2
     y, weights = (centre_axis(a[:, :1], column, order) for a, order in ((data.y, 3), (data.weights, 0)))
@@ -185,7 +185,7 @@ def run_solvers(scan: Slice) -> dict[str, Curve]:
 
     def states(name: str, x0: np.ndarray | None = None) -> Iterator[np.ndarray]:
         wanted = config.SolveSettings(name, iterations=STEPS.get(name, 1))
-        a = choose_storage(wanted, walk).apply(walk)
+        a = choose_matrix_storage(wanted, walk).apply(walk)
         problem = LeastSquares(a, scan.y, scan.weights, x0, nonnegative=name not in ("cgls", "fbp"))
         yield from (state.x for state in ALL_SOLVERS[name].run(problem))
 
@@ -202,7 +202,7 @@ def default_states(scan: Slice) -> Iterator[np.ndarray]:
     """States of the solver that mivol chooses (``solve.name = "auto"``)."""
     wanted, _ = resolve_solver(config.SolveSettings(), Projector(scan.beam, scan.grid))
     walk = Projector(scan.beam, subdivide_grid(scan.grid, wanted.supersampling, scan.beam))
-    walk = choose_storage(wanted, walk).apply(walk)
+    walk = choose_matrix_storage(wanted, walk).apply(walk)
     data, all_views = Projections(scan.beam, scan.y, scan.weights, is_noise_known=scan.photons > 0), np.arange(len(scan.y))
     start, prior = start_volume(wanted, walk, data, all_views), make_prior(wanted, walk, data, all_views)
     problem = ProjectionProblem(LeastSquares(walk, scan.y, scan.weights, start, wanted.nonnegative, prior))
