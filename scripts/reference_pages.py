@@ -114,7 +114,7 @@ def flag_rows(sub: argparse.ArgumentParser) -> list[tuple[str, str]]:
     for action in sub._actions:
         if action.dest == "help":
             continue
-        names = ", ".join(action.option_strings) or action.dest
+        names = ", ".join(action.option_strings) or action.metavar or action.dest
         named = action.metavar or action.dest.upper()
         named = named if isinstance(named, str) else " ".join(named)
         value = "" if action.nargs == 0 or not action.option_strings else f" {named}"

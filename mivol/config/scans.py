@@ -134,7 +134,7 @@ class ReadingSettings(Section):
             "1",
             "find the rotation axis; false: scan.axis_offset holds; entropy: by the entropy of slices, as a second opinion on "
             "detailed objects wider than the detector of a parallel beam (off by 0.26 columns in computed scans, mirror images "
-            "by 0.12; not for much noise or axes near an edge); absent: find it if that offset is 0",
+            "by 0.12; not for much noise or axes near an edge); absent: find the axis if scan.axis_offset is 0",
         ),
     ] = None
     air: (
@@ -153,8 +153,8 @@ class ReadingSettings(Section):
         int,
         setting(
             "1",
-            "times that an offset and a slope over time are fitted to each pixel, spread over the iterations (5 or more apart; "
-            "20 from an empty start); no more than chance: nothing changes; 0: never",
+            "how often an offset and a slope over time are fitted to each pixel, spread over the iterations (5 or more apart; "
+            "20 from an empty start); a fit no better than chance changes nothing; 0: never",
             ge=0,
         ),
     ] = 0
@@ -187,8 +187,8 @@ class ReadingSettings(Section):
             int,
             setting(
                 "pixel",
-                "gain, fit: longest period along the detector that is removed (this period by half); sort: columns of the "
-                "median, an odd number; absent: gain 14, fit 5, sort 7",
+                "gain, fit: period along the detector of which half is removed; shorter periods are removed, longer ones stay; "
+                "sort: columns of the median, an odd number; absent: gain 14, fit 5, sort 7",
                 ge=3,
             ),
         ]

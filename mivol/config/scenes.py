@@ -77,7 +77,7 @@ class Sought(Section):
     key: Annotated[str, setting("1", "key of mi.traverse(scene)", min_length=1)]
     unit: Annotated[str, setting("1", "unit of the value; empty: the usual unit of the key")] = ""
     domain: Annotated[
-        tuple[float, float] | None, setting("unit", "smallest and largest value; absent: those that make sense for the key")
+        tuple[float, float] | None, setting("unit", "smallest and largest value; absent: the usual ones of the key")
     ] = None
     map: Annotated[str, setting("1", "map from the optimizer's numbers: identity, softplus, log or logistic")] = "identity"
     lr: Annotated[float, setting("unit", "learning rate: typical change per step", gt=0)] = 0.1

@@ -96,7 +96,8 @@ class SceneFit(FitKind):
         strategies = [settings.optimizer, settings.loss, *priors]
         keys = ", ".join(parameter.key for parameter in settings.parameter)
         emission = ["nimier_david_2022"] if any(parameter.start_fit for parameter in settings.parameter) else []
-        method = f"{settings.fit.integrator}, {settings.optimizer.label()} on {settings.loss.label()}; parameter: {keys}"
+        names = f"optimizer {settings.optimizer.label()}, loss {settings.loss.label()}"
+        method = f"{settings.fit.integrator}, {names}; parameter: {keys}"
         return {
             "method": method,
             "seeds": {"fit": settings.seed, "references": getattr(settings.reference, "seed", 0)},
@@ -243,7 +244,7 @@ def resolve_depth(
         Settings with a number, and the reason; unchanged settings if ``max_depth`` is a number.
     """
     if settings.fit.max_depth is None:
-        depth, reason = read_integrator_settings(loaded.scene).max_depth, "the scene's integrator has it"
+        depth, reason = read_integrator_settings(loaded.scene).max_depth, "set by the scene's integrator"
     elif settings.fit.max_depth != AUTO:
         return settings, []
     elif truth is None and not isinstance(settings.reference, Rendered):
