@@ -56,7 +56,7 @@ __all__ = [
     "Files", "GaussianExperiment", "HashExperiment", "KINDS", "Known", "MODELS", "Matrices", "Measured", "NOT_RESULT",
     "NerfExperiment", "Nikon", "OctreeExperiment", "OctreeSettings", "OfData", "Parallel", "PhotoExperiment", "ReadingSettings",
     "Rendered", "ScanExperiment", "SceneExperiment", "Section", "ShowSettings", "SolveSettings", "Sought", "Stack", "ViewTable",
-    "Truth", "apply_change", "flatten_settings", "from_dict", "is_circle", "load", "of_photographs", "resolved",
+    "Truth", "apply_change", "flatten_settings", "from_dict", "is_circle", "load", "of_photographs", "list_all_settings",
 ]  # fmt: skip
 
 DEEP_KEY = re.compile(r"(?<![\w\"'.-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){100}")
