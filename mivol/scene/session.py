@@ -597,7 +597,7 @@ class _KeptSession:
     scene: mi.Scene
 
 
-# The last has rendered last.
+# In the order of their last renders.
 _kept: list[_KeptSession] = []
 atexit.register(_kept.clear)
 

@@ -70,8 +70,8 @@ def remove_rings(y: np.ndarray, weights: np.ndarray, method: str, width: int) ->
     bends. About half of a gain with a period of w along the detector is removed, and more of a shorter one.
 
     With 48 views or more, o is also found in arcs of the scan. A gain is the same in all arcs; details of the object move. So o
-    is reduced to its share on which the arcs agree, and to 0 in a row whose arcs agree only by chance (empirical Bayes). At a
-    width of ``FIRST_WIDTH`` they must agree too: gains of pixels do, and few details of the object.
+    is reduced to its share on which the arcs agree, and to 0 in a row whose arcs agree only by chance (empirical Bayes). The
+    arcs must agree at a width of ``FIRST_WIDTH`` too, where the offsets of gains agree and few details of the object do.
 
     ``"sort"`` replaces the value of rank k by the median of :math:`s_{k,\cdot}` over w columns; the outermost column continues
     beyond the edges. A row in which ``"gain"`` finds nothing keeps its values.
@@ -118,8 +118,8 @@ def _subtract_gains(y: np.ndarray, width: int) -> np.ndarray:
 def _exceeds_chance(offsets: np.ndarray) -> bool:
     """Whether the offsets of arcs of the scan (arcs, cols) agree better than by chance.
 
-    A gain is the same in all arcs; a detail of the object moves to other columns. So the variance of the mean offset is that
-    between arcs. Gains of pixels also show in a narrow width, in which neighbouring offsets are independent and few details of
+    A gain is the same in all arcs; a detail of the object moves to other columns. So without gains the variance of the mean
+    offset follows from the variance between arcs. Gains of pixels also show in a narrow width, in which neighbouring offsets are independent and few details of
     the object are left.
     """
     excess = _excess(offsets)

@@ -138,7 +138,7 @@ def align_views(
         y: line integrals (views, rows, cols).
         weights: inverse variances.
         refine: some of ``UNKNOWNS``. Detectors of fewer than 8 rows have moves along the columns only, and no tilt.
-        held_out: indices of views that judge; fewer than ``JUDGES``: every tenth too, or more often for at least eight.
+        held_out: indices of views that judge; if fewer than ``JUDGES``, every tenth view judges too, or more to reach eight.
         rounds: number of rounds.
 
     Raises:

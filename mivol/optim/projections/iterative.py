@@ -224,7 +224,7 @@ def _is_free(x: np.ndarray, g: np.ndarray) -> np.ndarray:
 
 
 def _scale_descent(problem: LeastSquares, x: np.ndarray, g: np.ndarray, diagonal: np.ndarray) -> np.ndarray:
-    """The negative gradient over the diagonal, in whose place it is written; 0 at voxels that the bound holds, or grazed."""
+    """The negative gradient over the diagonal, written into ``diagonal``; 0 at grazed voxels and at voxels held by the bound."""
     floor = np.asarray(GRAZED * float(np.max(diagonal, initial=0.0)) or 1, g.dtype)
 
     def scale(part: slice) -> None:
@@ -242,7 +242,7 @@ def _scale_descent(problem: LeastSquares, x: np.ndarray, g: np.ndarray, diagonal
 
 
 def _move(problem: LeastSquares, x: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """``x + step``, in the place of the step."""
+    """``x + step``, written into ``step``."""
 
     def add(part: slice) -> None:
         step[part] += x[part]

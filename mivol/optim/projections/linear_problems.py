@@ -169,11 +169,11 @@ def dot(a: np.ndarray, b: np.ndarray) -> float:
 
 
 GRAZED = 1e-6
-"""Sum of a ray's or a voxel's entries, over the largest sum, up to which it is only grazed and stays unchanged."""
+"""A ray or a voxel counts as grazed, and stays unchanged, if the sum of its entries is at most this share of the largest sum."""
 
 
 def invert_sums(v: np.ndarray, largest: float | None = None) -> np.ndarray:
-    """1 / v; 0 for v of grazed rays and voxels. ``largest``: the largest sum, if v is a part of all sums."""
+    """1 / v of sums v; 0 at grazed rays and voxels (``GRAZED``). ``largest``: the largest of all sums, if v is a part of them."""
     floor = GRAZED * (float(np.max(v, initial=0.0)) if largest is None else largest)
     return np.where(v > floor, 1.0 / np.where(v > floor, v, 1.0), 0.0).astype(v.dtype)
 
