@@ -119,8 +119,8 @@ def _exceeds_chance(offsets: np.ndarray) -> bool:
     """Whether the offsets of arcs of the scan (arcs, cols) agree better than by chance.
 
     A gain is the same in all arcs; a detail of the object moves to other columns. So without gains the variance of the mean
-    offset follows from the variance between arcs. Gains of pixels also show in a narrow width, in which neighbouring offsets are independent and few details of
-    the object are left.
+    offset follows from the variance between arcs. Gains of pixels also show in a narrow width, in which neighbouring offsets
+    are independent and few details of the object are left.
     """
     excess = _excess(offsets)
     return bool(excess.mean() > GAIN_DEVIATIONS * excess.std() / np.sqrt(len(excess)))

@@ -224,7 +224,7 @@ def _is_free(x: np.ndarray, g: np.ndarray) -> np.ndarray:
 
 
 def _scale_descent(problem: LeastSquares, x: np.ndarray, g: np.ndarray, diagonal: np.ndarray) -> np.ndarray:
-    """The negative gradient over the diagonal, written into ``diagonal``; 0 at grazed voxels and at voxels held by the bound."""
+    """The negative gradient over the diagonal, written into ``diagonal``; 0 at voxels grazed or held by the bound."""
     floor = np.asarray(GRAZED * float(np.max(diagonal, initial=0.0)) or 1, g.dtype)
 
     def scale(part: slice) -> None:

@@ -169,11 +169,11 @@ def dot(a: np.ndarray, b: np.ndarray) -> float:
 
 
 GRAZED = 1e-6
-"""A ray or a voxel counts as grazed, and stays unchanged, if the sum of its entries is at most this share of the largest sum."""
+"""A ray or a voxel is grazed, and stays unchanged, if its entries sum to at most this share of the largest sum."""
 
 
 def invert_sums(v: np.ndarray, largest: float | None = None) -> np.ndarray:
-    """1 / v of sums v; 0 at grazed rays and voxels (``GRAZED``). ``largest``: the largest of all sums, if v is a part of them."""
+    """1 / v of sums v; 0 at grazed rays and voxels. ``largest``: the largest of all sums, if v is a part of them."""
     floor = GRAZED * (float(np.max(v, initial=0.0)) if largest is None else largest)
     return np.where(v > floor, 1.0 / np.where(v > floor, v, 1.0), 0.0).astype(v.dtype)
 
