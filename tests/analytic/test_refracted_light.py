@@ -74,6 +74,11 @@ SCENES = {
         "other": lamp(0.3, (-2, 0.5, 1)),
         "sky": sky(0.05),
     },
+    "glass with holes beside a glass bead": lambda: {
+        "ball": {"type": "sphere", "bsdf": {"type": "mask", "opacity": 0.5, "glass": glass()}, "interior": fog()},
+        "bead": {"type": "sphere", "radius": 0.2, "center": [0, -1.3, 0], "bsdf": glass()},
+        "lamp": lamp(1.5),
+    },
     "a ball in a glass ball": lambda: {
         "outer": {"type": "sphere", "radius": 1.1, "bsdf": glass()},
         "inner": {"type": "sphere", "radius": 0.9, "bsdf": glass(1.33, IOR), "interior": fog()},

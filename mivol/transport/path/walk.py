@@ -34,7 +34,7 @@ from mivol.transport.estimators.lighting.direct_lighting import (
 )
 from mivol.transport.estimators.lighting.emitters import is_among
 from mivol.transport.estimators.lighting.kept_rays import LARGEST_REFLECTANCE, KeptMirror
-from mivol.transport.estimators.lighting.refracted_light import RefractedSamples, VertexBeforeGlass
+from mivol.transport.estimators.lighting.refracted_light import RefractedSamples, VertexBeforeGlass, refracts_only
 from mivol.transport.estimators.lighting.tabulated_shadows import KeptShadow
 from mivol.transport.estimators.scores import IMAGE, Primal, Replay, Tangent, TrackedTerm
 from mivol.transport.estimators.segment import Collision, KnownFlight, PathSegment
@@ -614,7 +614,7 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
     if path.before_glass is not None:
         is_smooth = event.in_medium | ~onward.delta
         fresh = VertexBeforeGlass(onward.origin, mi.Vector3f(onward.ray.d), onward.pdf, mi.Bool(False), mi.Bool(False))
-        old = path.before_glass.at_specular(scatters & ~is_smooth, onward.mirrored)
+        old = path.before_glass.at_specular(scatters & ~is_smooth, onward.mirrored | ~refracts_only(event.si))
         path.before_glass = dr.select(scatters & is_smooth, fresh, old)
 
     # -- Russian roulette ----------------------------------------------------------------------------------------------

@@ -32,7 +32,7 @@ from mivol.transport.estimators.lighting.vertex import Vertex
 from mivol.transport.traversal.random_numbers import fork_state
 from mivol.transport.traversal.rays import FineRay, spawn_ray
 
-__all__ = ["TRANSMITS", "RefractedLighting", "RefractedSamples", "VertexBeforeGlass"]
+__all__ = ["TRANSMITS", "RefractedLighting", "RefractedSamples", "VertexBeforeGlass", "refracts_only"]
 
 
 FAR = 1e4
@@ -47,6 +47,15 @@ MIN_WIDTH = 2e-3
 
 TRANSMITS = 1 - 2**-24
 """Largest float32 below 1. Mitsuba's glass transmits for numbers above the reflectance, with the density 1 - reflectance."""
+
+
+REFRACTS = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
+"""Flags of the BSDFs that only mirror and refract."""
+
+
+def refracts_only(si: mi.SurfaceInteraction3f) -> mi.Bool:
+    """Whether a surface only mirrors and refracts. Glass with holes, or blended with paint, is left to chance."""
+    return (si.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.All))) == REFRACTS
 
 
 @dataclass
@@ -73,7 +82,8 @@ class VertexBeforeGlass:
         d: the direction.
         pdf: density of the direction [1/sr].
         was_transmitted: lanes that smooth glass has transmitted since.
-        was_mirrored: lanes that a surface has mirrored since, and lanes without such a vertex.
+        was_mirrored: lanes that a surface has mirrored since, or transmitted without being smooth glass, and lanes without
+            such a vertex.
     """
 
     interaction: mi.Interaction3f
@@ -89,7 +99,7 @@ class VertexBeforeGlass:
         return cls(dr.zeros(mi.Interaction3f, n), dr.zeros(mi.Vector3f, n), dr.zeros(mi.Float, n), none, ~none)
 
     def at_specular(self, on: mi.Bool, mirrors: mi.Bool) -> VertexBeforeGlass:
-        """The same vertex after a surface has mirrored or transmitted the path in the lanes ``on``."""
+        """The same vertex after a surface has turned paths in the lanes ``on``; ``mirrors``: not through smooth glass."""
         transmitted, mirrored = self.was_transmitted | (on & ~mirrors), self.was_mirrored | (on & mirrors)
         return VertexBeforeGlass(self.interaction, self.d, self.pdf, transmitted, mirrored)
 
@@ -240,7 +250,7 @@ class RefractedLighting:
         away = mi.Vector3f(centre - it.p)
         straight = dr.normalize(away)
         si = self.media.tracer.ray_intersect(it.spawn_ray(straight), mi.RayFlags.All, False, active)
-        on = active & si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
+        on = active & si.is_valid() & refracts_only(si)
         # The relative index is the same at each angle of incidence, and light along the normal is never mirrored as a whole.
         level = mi.SurfaceInteraction3f(si)
         level.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(1), si.wi.z))
@@ -270,7 +280,7 @@ class RefractedLighting:
             L = state.L + dr.select(lit, T * emitter.eval(si, lit), 0)
             # -- Through the glass --------------------------------------------------------------------------------------
             on = state.on & si.is_valid() & dr.any(T != 0) & (state.depth + 1 < limit)
-            on &= mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
+            on &= refracts_only(si)
             sample, weight = si.bsdf().sample(mi.BSDFContext(), si, mi.Float(TRANSMITS), mi.Point2f(0.5), on)
             on &= mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaTransmission)
             onward = FineRay.from_ray(spawn_ray(si, si.to_world(sample.wo), media.size))
