@@ -78,10 +78,12 @@ class OrientedBox:
     def distance(self, point: np.ndarray) -> float:
         """Distance of a point, over the longest edge [1]; 0 inside. For a sheared box, at most the distance."""
         edges = self.corners[[4, 2, 1]] - self.corners[0]
-        inside = np.linalg.solve(edges.T, point - self.corners[0])
+        # The box of a rectangle has no third edge: least squares leave the way to its plane.
+        inside = np.linalg.lstsq(edges.T, point - self.corners[0])[0]
+        above = point - self.corners[0] - inside @ edges
         lengths = np.linalg.norm(edges, axis=1)
         away = (inside - np.clip(inside, 0, 1)) * lengths
-        return float(np.linalg.norm(away) / lengths.max())
+        return float(np.hypot(np.linalg.norm(away), np.linalg.norm(above)) / lengths.max())
 
     def contains(self, other: OrientedBox) -> bool:
         """Whether another box lies inside, to ``FACE_TOLERANCE``."""

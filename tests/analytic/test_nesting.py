@@ -47,6 +47,14 @@ def test_a_gap_counts_in_sizes_of_the_larger_box(turn: np.ndarray, size: float, 
     assert one.shares(one) and not one.shares(box(np.full(3, 1.5 * size), np.full(3, 2 * size), turn))
 
 
+@pytest.mark.parametrize("turn", [np.eye(3), rotation([1, 2, 3], 0.7)], ids=["upright", "turned"])
+def test_a_flat_box_has_distances(turn: np.ndarray) -> None:
+    """The box of a rectangle of 4 by 2: over its middle, beside it, and both, over its longest edge."""
+    flat = box(np.array([-2.0, -1, 0]), np.array([2.0, 1, 0]), turn)
+    for point, expected in (([1, 0.5, 0], 0), ([0, 0, 3], 3), ([5, 0, 0], 3), ([5, 0, -4], 5)):
+        assert flat.distance(turn @ point) == pytest.approx(expected / 4, abs=1e-12)
+
+
 @pytest.mark.parametrize("axis", range(3))
 def test_a_face_parts_boxes_that_are_turned_otherwise(axis: int) -> None:
     """A corner of one box points at the middle of a face of the other: no other plane separates them."""

@@ -239,3 +239,13 @@ def test_explain_measures_the_light_grid():
     emitter, _ = sun([0.3, 0.2, -1.0])
     text = explain(close_up({"smoke": box, "emitter": emitter}), max_depth=2)
     assert "exact; with deterministic, a light grid" in text and "bias" in text
+
+
+def test_microflakes_beside_paths_without_a_shadow(variant_rgb: str) -> None:
+    """The projected area of microflakes has no value along the ray of a path that has kept no shadow."""
+    matrix = np.tile(np.array([0.2, 0.2, 0.8, 0.0, 0.05, 0.0]), (2, 2, 2, 1))
+    flakes = {"type": "sggx", "S": grid_volume("gridvolume", matrix)}
+    fog = medium("heterogeneous", grid_volume("gridvolume", rough_grid(3, 6.0), PLACE), 0.9, phase=flakes)
+    scene = close_up({"fog": box_of(fog, PLACE), "sun": sun((0.5, 0.4, -1))[0]})
+    assert "table" in explain(scene, DEPTH)
+    assert np.isfinite(np.asarray(mi.render(scene, integrator=mi.load_dict(mivol(max_depth=DEPTH)), spp=32))).all()

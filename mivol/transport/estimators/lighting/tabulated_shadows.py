@@ -307,4 +307,5 @@ class KeptShadow(KeptRay):
         direct = dr.zeros(mi.DirectionSample3f, dr.width(self.weight))
         direct.p, direct.time = self.aim, ray.time
         _, clear, _, T = trace_shadow_ray(media, self.p, self.medium, direct, on)
-        return dr.select(clear, self.light_of_all() * T, 0)
+        # Lanes without a ray have no direction, and T of microflakes is NaN there.
+        return dr.select(on & clear, self.light_of_all() * T, 0)
