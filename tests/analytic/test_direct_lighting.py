@@ -68,9 +68,9 @@ def test_a_dark_sample_has_no_shadow_ray_in_images(attached, monkeypatch):
     """An emitter below the wall, whose light the wall does not scatter upwards; derivatives follow all rays."""
     module, lanes = sys.modules[DirectLighting.__module__], []
 
-    def trace(media, start, medium, aim, active, rng):
+    def trace(media, start, medium, aim, active, *others):
         lanes.append(bool(active[0]))
-        return trace_shadow_ray(media, start, medium, aim, active, rng)
+        return trace_shadow_ray(media, start, medium, aim, active, *others)
 
     monkeypatch.setattr(module, "trace_shadow_ray", trace)
     for z in (FAR, -FAR):

@@ -15,6 +15,9 @@ from scattering_gradients import BATCHES, assert_gradient, gradients, twin_diffe
 from scattering_scenes import PLACE, aimed, mivol, pencils, point, rough_grid, smoke, spot, sun
 
 import scenes
+from mivol.transport.estimators.lighting.moving_emitters import _face_direction
+from mivol.transport.traversal.box import UNIT_CUBE
+from mivol.transport.traversal.rays import FineRay
 from mivol.validate.statistics import Moments
 from scenes import as_float32, box_of, grid_volume, medium
 
@@ -166,3 +169,14 @@ def test_place_of_an_emitter_behind_balls(name, emitter):
     # A ray along a plane of voxels turns over a kink within h: a share h / voxel of the slope, 1.2e-2 of one ray in six; of the
     # rest truncation is 1e-5 and rounding 1e-7 / h.
     assert np.abs(found - truth).max() <= 3e-3 * np.abs(truth).max()
+
+
+def test_an_edge_belongs_to_the_steeper_face():
+    """A ray nearly in the face y = 0 leaves through x = 1. Rounding puts the point as far from x = 1 as from y = 0."""
+    d = np.array([1, 1e-8, 0.1])
+    d /= np.linalg.norm(d)
+    ray = FineRay(mi.Point3d(0.2, 0, 0.3), mi.Vector3f(d.tolist()), mi.Float(9), mi.Float(0), mi.Color0f())
+    rows = [[mi.Float64(float(i == j)) for j in range(3)] + [mi.Float64(0)] for i in range(3)]
+    for rounding in (-1e-7, 0, 1e-7):
+        face = _face_direction(rows, *UNIT_CUBE, ray, mi.Float64(0.8 / d[0] * (1 + rounding)))
+        np.testing.assert_allclose(np.ravel(face), [1 / d[0], 0, 0], rtol=1e-6)

@@ -35,6 +35,10 @@ SIDE_STEP = 1e-5
 """Distance from a surface at which the extinction is read on either side, as a fraction of the distance along the ray [1]: ten
 times its rounding."""
 
+EDGE = 1e-6
+"""Distance from two faces of a box at which a point lies at their edge, over the size of the box [1]. The ends of segments in a
+grid are rounded to float32, 6e-8 of their distance."""
+
 
 def optical_depth_gradient(
     media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], active: mi.Bool
@@ -216,17 +220,20 @@ def _boundary_direction(body: Body, ray: Ray, t: mi.Float64) -> mi.Vector3f:
 
 
 def _face_direction(rows: list, low: tuple, high: tuple, ray: Ray, t: mi.Float64) -> mi.Vector3f:
-    """n / (n . w) of the face of a box at a point of a ray."""
-    best, normal = mi.Float64(dr.inf), mi.Vector3f(0)
+    """n / (n . w) of the face of a box at a point of a ray; at an edge, of the face that the ray crosses more steeply.
+
+    Rays towards an emitter in the plane of a face may run in this plane, and 1 / (n . w) has no bound there.
+    """
+    best, steepest, normal = mi.Float64(dr.inf), mi.Float64(0), mi.Vector3f(0)
     p = point_along(ray, t)
     for row, a, b in zip(rows, low, high, strict=True):
         q = map_point(row, p)
         speed = sum(row[k] * mi.Float64(ray.d[k]) for k in range(3))
-        off = dr.minimum(dr.abs(q - a), dr.abs(q - b)) / (b - a)
-        nearer = (off < best) & (speed != 0)
+        off, steepness = dr.minimum(dr.abs(q - a), dr.abs(q - b)) / (b - a), dr.abs(speed) / (b - a)
+        nearer = (off < best - EDGE) | ((off < best + EDGE) & (steepness > steepest))
         inv = dr.rcp(dr.select(speed != 0, speed, 1))
         normal = dr.select(nearer, mi.Vector3f(*(mi.Float(row[k] * inv) for k in range(3))), normal)
-        best = dr.select(nearer, off, best)
+        best, steepest = dr.select(nearer, off, best), dr.select(nearer, steepness, steepest)
     return normal
 
 
