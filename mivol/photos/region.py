@@ -247,17 +247,17 @@ def _cell_centres(box: np.ndarray, n: int) -> np.ndarray:
 # -- Boxes from points, and nested boxes --------------------------------------------------------------------------
 
 
-def box_of_points(points: np.ndarray, share: float = 0.98, margin: float = 0.05) -> np.ndarray:
-    """Return the box of the middle ``share`` of points (N, 3) along each axis, enlarged by ``margin`` on each side.
+def box_of_points(points: np.ndarray) -> np.ndarray:
+    """Return the box of the middle 98 % of points (N, 3) along each axis, enlarged by 5 % on each side.
 
     Percentiles are used because sparse reconstructions have far outliers.
     """
-    cut = 50 * (1 - share)
-    low, high = np.percentile(points, [cut, 100 - cut], axis=0)
-    return np.array([low - margin * (high - low), high + margin * (high - low)])
+    low, high = np.percentile(points, [1, 99], axis=0)
+    margin = 0.05 * (high - low)
+    return np.array([low - margin, high + margin])
 
 
-def check_box(box: np.ndarray, name: object = "box") -> np.ndarray:
+def check_box(box: np.ndarray) -> np.ndarray:
     """Return the box as (2, 3) float64.
 
     Raises:
@@ -265,7 +265,7 @@ def check_box(box: np.ndarray, name: object = "box") -> np.ndarray:
     """
     corners = np.asarray(box, np.float64)
     if corners.shape != (2, 3) or not np.isfinite(corners).all() or not (corners[0] < corners[1]).all():
-        raise refusal(name, f"the box {corners.tolist()}", "[low, high] with low below high along x, y, z", "correct box=")
+        raise refusal("box", f"the box {corners.tolist()}", "[low, high] with low below high along x, y, z", "correct box=")
     return corners
 
 

@@ -53,24 +53,28 @@ class Scale(NamedTuple):
     high: float
 
 
-def shared_scale(*images: NDArray, low: float | None = 0.0, kind: str | None = None, percentile: float = 99.8) -> Scale:
-    """Return a scale for several images, from ``low`` (None: the smallest value) to a percentile of their values.
+HIGH = 99.8
+"""Percentile of the values at the upper end of a scale [%]."""
+
+
+def shared_scale(*images: NDArray, kind: str | None = None) -> Scale:
+    """Return a scale for several images, from 0, or from a low percentile below 0, to a high percentile of their values.
 
     A percentile instead of the maximum keeps one firefly from turning the rest black.
     """
     values = np.concatenate([image[np.isfinite(image)].ravel() for image in images])
     if values.size == 0:
         return Scale(kind or "grey", 0.0, 1.0)
-    bottom = float(values.min()) if low is None else min(low, float(np.percentile(values, 100 - percentile)))
-    top = float(np.percentile(values, percentile))
+    bottom = min(0.0, float(np.percentile(values, 100 - HIGH)))
+    top = float(np.percentile(values, HIGH))
     kind = kind or ("colour" if any(_channels(image) == 3 for image in images) else "grey")
     return Scale(kind, bottom, top if top > bottom else bottom + 1.0)
 
 
-def signed_scale(*images: NDArray, percentile: float = 99.8) -> Scale:
+def signed_scale(*images: NDArray) -> Scale:
     """Return a symmetric scale for several differences."""
     values = np.concatenate([np.abs(image[np.isfinite(image)]).ravel() for image in images])
-    limit = float(np.percentile(values, percentile)) if values.size else 0.0
+    limit = float(np.percentile(values, HIGH)) if values.size else 0.0
     return Scale("signed", -limit if limit else -1.0, limit or 1.0)
 
 

@@ -14,6 +14,7 @@ phase functions, and ignores extinction and occlusion: the gain decides about no
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -212,9 +213,9 @@ class MediaLight:
 
     Attributes:
         density, cumulative: as in :class:`mivol.transport.estimators.lighting.emission_sampling.EmissionTable`.
-        gain: predicted gain in time to an error of sampling over chance [1].
+        gain: predicted gain in time to an error of sampling over chance [1]; NaN after the plan, which has used it.
     """
 
     density: mi.Float
     cumulative: mi.Float64
-    gain: float = 0.0
+    gain: float = math.nan

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import mitsuba as mi
 import numpy as np
@@ -22,7 +23,10 @@ from mivol.bench.studies import (
     cluster_kills,
     conversions,
     depth,
+    everyday,
+    gradients,
     media_light,
+    multiple_scattering,
     optical_depth,
     points,
     representations,
@@ -91,6 +95,26 @@ def arrange_tiny_fits(folder: Path) -> list:
     return [steps._draw_places(9, 1), photos]
 
 
+def arrange_everyday(folder: Path) -> list:
+    """All but the smoke, which is a ramp here."""
+    with patch.object(everyday, "_puffs", lambda res: np.linspace(0, 1, 24, dtype=np.float32).reshape(2, 3, 4)):
+        return [scene.load(2) for scene in everyday.SCENES.values()]
+
+
+def arrange_derivatives(folder: Path) -> list:
+    """Of one scattering and of many, where light is trapped and where it leaves."""
+    lights = [light for _, named in gradients.CONTESTS.values() for light in named.values()]
+    kinds = [replace(lights[0], depth=depth) for depth in (-1, 4)]
+    trapping = [light for light in lights if light.traps_light]
+    deep = [gradients.make_deep_cases(4, light) for light in (*kinds, *(replace(x, depth=-1) for x in trapping[:1]))]
+    return [asdict(case) for cases in (gradients.make_cases(4), *deep) for case in cases.values()]
+
+
+def arrange_volumes(folder: Path) -> list:
+    volumes = [make().values for make in (multiple_scattering.thin_smoke, multiple_scattering.white_box, multiple_scattering.milk)]
+    return [np.ravel(values)[:: max(1, np.size(values) // 999)] for values in volumes]
+
+
 ARRANGEMENTS: dict[str, tuple[Callable[[Path], object], float]] = {
     "clouds of Gaussians": (arrange_clouds, -36.0922162),
     "sparse fit": (arrange_sparse_fit, 48.3591594),
@@ -100,6 +124,9 @@ ARRANGEMENTS: dict[str, tuple[Callable[[Path], object], float]] = {
     "settings": (arrange_settings, -3.4204918),
     "plans of fits": (arrange_plans, -85.9905014),
     "tiny fits": (arrange_tiny_fits, -59.4630654),
+    "everyday scenes": (arrange_everyday, -79.0907063),
+    "cases of derivatives": (arrange_derivatives, 3.40218109),
+    "volumes of many scatterings": (arrange_volumes, 14.5810524),
     "cubes": (lambda folder: [depth.make_cube(*kind, 0.5, 2.0) for kind in depth.TABLES], -29.4280929),
     "media that emit": (lambda folder: [media_light.make_scene(name, 8) for name in ("fire", "fog", "room")], 166.266753),
     "tutorial": (lambda folder: tutorial.tutorial_scene(mi.TensorXf(np.ones((2, 2, 2, 1)))), 32.1874398),
@@ -183,3 +210,71 @@ def test_kills_are_told_in_a_line() -> None:
     (line,) = cluster_kills.table("render", answer)
     found = "render: 4 of 5 runs with a killed worker ended, 3 equal to the bit, largest difference 2e-08, 7 pieces of"
     assert line.startswith(found)
+
+
+def test_the_cost_of_messages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a clock by which a round takes 1 ms and 2 ns a byte, and the first three rounds of a size 1 ms more."""
+    clock, sent = [0.0], []
+
+    def run(units: list, ahead: int) -> list:
+        sizes = {unit.args[0].nbytes for unit in units}
+        sent.extend(sizes)
+        clock[0] += 1e-3 + 1e-3 * (sent.count(sent[-1]) <= 3) + 2e-9 * sum(sizes)
+        return [cluster.echo(None, unit.args[0]) for unit in units]
+
+    monkeypatch.setattr(cluster, "two_workers", lambda: nullcontext((SimpleNamespace(run=run), Path())))
+    monkeypatch.setattr(cluster.time, "perf_counter", lambda: clock[0])
+    answer = cluster.measure_messages(replace(cluster.ClusterSize.quick(), rounds=2))
+    sizes = [4 << 10, 4 << 18, 4 << 20]
+    assert sent == [size for size in sizes for _ in range(12)]
+    assert answer["seconds"] == {
+        size: {k: pytest.approx(1e-3 + 2e-9 * size) for k in ("median", "fastest")} for size in sizes
+    }
+    assert answer["latency"] == pytest.approx((1e-3 + 2e-9 * sizes[0]) / 2)
+    assert answer["bandwidth"] == pytest.approx(2 * sizes[2] / (1e-9 * (sizes[2] - sizes[0])))
+
+
+def test_a_smoke_is_fitted_for_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step of 0.3 s after one that compiles; views of two are held out, whose renders are half as bright."""
+    views = [representations.View(str(k), f"sensor {k}", np.full((2, 2, 3), 0.5)) for k in range(4)]
+    begun = SimpleNamespace(next_iteration=0)
+    seen: dict = {}
+
+    class Stopwatch:
+        processor = 0.0
+
+        def __enter__(self) -> None: ...
+
+        def __exit__(self, *error: object) -> None:
+            self.processor += 0.3
+
+    def make_problem(scene: dict, train: list, parameters: list, integrator: object, spp: int) -> SimpleNamespace:
+        seen.update(scene=scene, train=[view.name for view in train], rates={p.name: p.lr for p in parameters}, spp=spp)
+        return SimpleNamespace(values=lambda: {"a": SimpleNamespace(array=mi.Float(1, 2, 3)), "b": SimpleNamespace(array=mi.Float(4))})
+
+    def begin(problem: object, optimizer: object, steps: int) -> SimpleNamespace:
+        seen.update(epsilon=optimizer.epsilon, steps=steps)
+        return begun
+
+    def advance() -> None:
+        begun.next_iteration += 1
+
+    def render(scene: dict, sensor: str, **options: object) -> np.ndarray:
+        seen.setdefault("judged", []).append((sensor, options["spp"]))
+        return np.full((2, 2, 3), 0.25 if sensor == "sensor 1" else 0.5)
+
+    begun.advance = advance
+    monkeypatch.setattr(mi, "load_dict", lambda parts: parts)
+    monkeypatch.setattr(mi, "render", render)
+    for name, made in {"Stopwatch": Stopwatch, "SceneProblem": make_problem, "begin_fit": begin, "SMOKE_JUDGED": (1,)}.items():
+        monkeypatch.setattr(representations, name, made)
+    monkeypatch.setattr(representations, "make_integrator", lambda name, depth: (name, depth))
+    size = replace(representations.RepresentationSize.quick(), smoke_seconds=1.0)
+    fit = representations.SmokeFit({"type": "given"}, {"data": 0.5}, (0, 1), 1e-3)
+    answer = representations.fit_smoke(fit, views, {}, 0.9, size)
+    interior = seen["scene"]["box"]["interior"]
+    assert (interior["type"], interior["sigma_t"]) == ("mivol_medium", {"type": "given"})
+    assert seen["train"] == ["0", "2", "3"] and list(seen["rates"].values()) == [0.5]
+    assert (seen["epsilon"], seen["spp"], seen["judged"]) == (1e-3, size.smoke_spp, [("sensor 1", size.smoke_reference)])
+    half, quarter = (1.055 * x ** (1 / 2.4) - 0.055 for x in (0.5, 0.25))
+    assert answer == {"psnr": pytest.approx(-20 * np.log10(half - quarter), rel=1e-5), "steps": 5, "numbers": 4}

@@ -322,24 +322,21 @@ def join_slopes(each: list[dict[str, mi.Float]]) -> dict[str, mi.Float]:
     return joined
 
 
-def find_region(field: SampledField, cells: int, samples_a_cell: float = 2.0, rounds: int = 8, seed: int = 0) -> SampledField:
+def find_region(field: SampledField, cells: int) -> SampledField:
     """A field with its occupied cells, as rays and files need them: of a network that was not fitted here.
 
     Args:
         field: hash grid or NeRF in an upright box.
         cells: along the longest edge of the box.
-        samples_a_cell: samples of a ray along the edge of a cell.
-        rounds: points at which each cell is evaluated.
-        seed: of the points.
 
-    Bias: as of :mod:`mivol.transport.traversal.occupancy`; matter that all points of a cell miss is lost.
+    Bias: as of :mod:`mivol.transport.traversal.occupancy`; matter that all eight points of a cell miss is lost.
     """
     low = field.to_world[:3, 3]
     res, place = place_grid(np.array([low, low + field.edges]), cells)
     occupancy = Occupancy.full(res, place)
-    for u in np.random.default_rng(seed).random(rounds):
+    for u in np.random.default_rng(0).random(8):
         occupancy = occupancy.refreshed(field.density, float(u))
-    return replace(field, region=occupancy.region(float(place[0, 0] / res[2]) / samples_a_cell))
+    return replace(field, region=occupancy.region(float(place[0, 0] / res[2]) / SampledPlan.samples_a_cell))
 
 
 SAMPLE = 4 * 160

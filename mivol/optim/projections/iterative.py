@@ -211,9 +211,10 @@ def _direction(
 
 def _add_majoriser(problem: LeastSquares, x: np.ndarray, g: np.ndarray, data_diagonal: np.ndarray | None) -> np.ndarray:
     """Add the gradient of the prior to ``g``; return the diagonal of the majoriser, 1 without a preconditioner."""
-    diagonal = np.ones_like(g) if data_diagonal is None else data_diagonal
-    total = problem.prior.add_derivatives(x, g, diagonal) if problem.prior else diagonal.copy()
-    return diagonal if data_diagonal is None else total
+    diagonal = np.ones_like(g) if data_diagonal is None else data_diagonal.copy()
+    if problem.prior:
+        problem.prior.add_derivatives(x, g, None if data_diagonal is None else diagonal)
+    return diagonal
 
 
 def _is_free(x: np.ndarray, g: np.ndarray) -> np.ndarray:
@@ -374,7 +375,7 @@ def transmission_likelihood(problem: PoissonCounts, state: SolverState | None = 
         gradient = a.T @ counts.slope(line).astype(a.dtype)
         bound = a.T @ (counts.optimum_curvature(line) * chord).astype(a.dtype)
         if prior:
-            bound = prior.add_derivatives(x, gradient, bound)
+            prior.add_derivatives(x, gradient, bound)
         x = np.maximum(x - gradient * invert_sums(bound), 0)
         state = counts.state(x, state.iteration + 1, a @ x)
         yield state

@@ -283,16 +283,15 @@ class SmoothedTV:
         """The penalty."""
         return self._scale * self._sum(_penalties, x)
 
-    def add_derivatives(self, x: np.ndarray, gradient: np.ndarray, diagonal: np.ndarray) -> np.ndarray:
-        """Add the derivative (n,) of the penalty to ``gradient``; return a diagonal (n,) of its majoriser plus ``diagonal``.
+    def add_derivatives(self, x: np.ndarray, gradient: np.ndarray, diagonal: np.ndarray | None) -> None:
+        """Add the derivative (n,) of the penalty to ``gradient``, and a diagonal (n,) of its majoriser to ``diagonal``, if given.
 
         The diagonal follows from ``(p - q)^2 <= 2 p^2 + 2 q^2`` on each difference.
         """
-        total = np.empty_like(diagonal)
         for voxels, (slope, bound) in self._run(_derivatives, x):
             gradient[voxels] += slope
-            np.add(diagonal[voxels], bound, out=total[voxels])
-        return total
+            if diagonal is not None:
+                diagonal[voxels] += bound
 
     def curvature(self, x: np.ndarray, p: np.ndarray) -> float:
         """Second derivative of the majoriser at ``x`` along ``p``."""
