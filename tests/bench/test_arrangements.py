@@ -111,7 +111,8 @@ def arrange_derivatives(folder: Path) -> list:
 
 
 def arrange_volumes(folder: Path) -> list:
-    volumes = [make().values for make in (multiple_scattering.thin_smoke, multiple_scattering.white_box, multiple_scattering.milk)]
+    makers = multiple_scattering.thin_smoke, multiple_scattering.white_box, multiple_scattering.milk
+    volumes = [make().values for make in makers]
     return [np.ravel(values)[:: max(1, np.size(values) // 999)] for values in volumes]
 
 
@@ -250,7 +251,8 @@ def test_a_smoke_is_fitted_for_its_time(monkeypatch: pytest.MonkeyPatch) -> None
 
     def make_problem(scene: dict, train: list, parameters: list, integrator: object, spp: int) -> SimpleNamespace:
         seen.update(scene=scene, train=[view.name for view in train], rates={p.name: p.lr for p in parameters}, spp=spp)
-        return SimpleNamespace(values=lambda: {"a": SimpleNamespace(array=mi.Float(1, 2, 3)), "b": SimpleNamespace(array=mi.Float(4))})
+        arrays = {"a": mi.Float(1, 2, 3), "b": mi.Float(4)}
+        return SimpleNamespace(values=lambda: {name: SimpleNamespace(array=array) for name, array in arrays.items()})
 
     def begin(problem: object, optimizer: object, steps: int) -> SimpleNamespace:
         seen.update(epsilon=optimizer.epsilon, steps=steps)

@@ -1,8 +1,8 @@
 """What plans choose for made-up scenes, as sums: choices of cost and noise leave the mean of an image as it is.
 
-A fault in a measured cost, a limit or a count makes renders slower or noisier, which no comparison of means sees. A table of many
-scenes, with facts on both sides of each limit and on it, holds all numbers of the plans. Another choice that is meant gives
-another sum, which the failing test prints.
+A fault in a measured cost, a limit or a count makes renders slower or noisier, which no comparison of means sees. A table of
+many scenes, with facts on both sides of each limit and on it, holds all numbers of the plans. Another choice that is meant
+gives another sum, which the failing test prints.
 """
 
 from __future__ import annotations
@@ -62,7 +62,8 @@ def scene(*media: MediumFacts, noise: tuple[float, float, float] = NOISE[0], **m
         "has_glass": True, "boundaries": tuple(SimpleNamespace(box=1, around=1, hole=None) for _ in media),
         "views": (), "are_emitters_far": True, "endless_media": (), "are_samples_independent": True, "is_colour_film": True,
         "emitter_distances": (0.3, math.inf), "near_gain": a, "lamp_noise": (a, b), "branch_noise": BranchNoise(b, a, 0.4, c),
-        "emission_noise": OwnRaysNoise(a + b, b, c), "mirror_noise": MirrorNoise(OwnRaysNoise(a, b, c), b),
+        "emission_noise": OwnRaysNoise(a + b, b, c / 8),
+        "mirror_noise": MirrorNoise(OwnRaysNoise(a + b, b, c / 8), b if c > 1 else math.inf),
         "media_light": SimpleNamespace(gain=a),
     }  # fmt: skip
     made = SimpleNamespace(**{**given, **more})
@@ -128,9 +129,9 @@ def by_rays() -> Iterator[float]:
 
 
 PLANS: dict[str, tuple[Callable[[], Iterator[float]], float]] = {
-    "media": (by_medium, 587.323359811),
-    "noise": (by_noise, 417.388256374),
-    "limits": (by_limit, 927.677263274),
+    "media": (by_medium, 166.150234611),
+    "noise": (by_noise, 259.53824633),
+    "limits": (by_limit, 442.045490882),
     "paths of a baseline": (by_rays, -1.81897295049),
 }
 """Scenes, and the sum of all numbers of their plans, each times a weight of its place."""

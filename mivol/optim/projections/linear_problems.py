@@ -284,7 +284,7 @@ class SmoothedTV:
         return self._scale * self._sum(_penalties, x)
 
     def add_derivatives(self, x: np.ndarray, gradient: np.ndarray, diagonal: np.ndarray | None) -> None:
-        """Add the derivative (n,) of the penalty to ``gradient``, and a diagonal (n,) of its majoriser to ``diagonal``, if given.
+        """Add the derivative (n,) of the penalty to ``gradient``; add a diagonal (n,) of its majoriser to a given ``diagonal``.
 
         The diagonal follows from ``(p - q)^2 <= 2 p^2 + 2 q^2`` on each difference.
         """
