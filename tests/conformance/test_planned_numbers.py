@@ -64,7 +64,8 @@ def scene(*media: MediumFacts, noise: tuple[float, float, float] = NOISE[0], **m
         "emitter_distances": (0.3, math.inf), "near_gain": a, "lamp_noise": (a, b), "branch_noise": BranchNoise(b, a, 0.4, c),
         "emission_noise": OwnRaysNoise(a + b, b, c / 8),
         "mirror_noise": MirrorNoise(OwnRaysNoise(a + b, b, c / 8), b if c > 1 else math.inf),
-        "media_light": SimpleNamespace(gain=a), "emitters": (), "refracted_noise": SimpleNamespace(by_chance=a + b, drawn=c / 4),
+        "media_light": SimpleNamespace(gain=a), "emitters": (),
+        "refracted_noise": SimpleNamespace(by_chance=a + b, drawn=c / 4),
     }  # fmt: skip
     made = SimpleNamespace(**{**given, **more})
     made.nearness = min(made.emitter_distances, default=math.inf)
@@ -82,7 +83,8 @@ LIMITS = [
     *({name: True} for name in ("is_sealed",)),
     *({name: False} for name in
       ("has_lamps", "has_glass", "are_emitters_far", "are_samples_independent", "is_colour_film")),
-    *({name: None} for name in ("lamp_noise", "branch_noise", "emission_noise", "mirror_noise", "refracted_noise", "media_light")),
+    *({name: None} for name in
+      ("lamp_noise", "branch_noise", "emission_noise", "mirror_noise", "refracted_noise", "media_light")),
     {"surfaces": ()}, {"refractive": ("glass",)}, {"endless_media": ("fog",)}, {"parameters": ("a", "b")},
     {"variant": "cuda_ad_rgb"}, {"variant": "metal_ad_rgb"},
 ]  # fmt: skip
