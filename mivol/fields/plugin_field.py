@@ -28,7 +28,8 @@ UNKNOWN = 64
 class PluginField:
     """A bounded extinction (:class:`mivol.fields.protocol.Field`) that calls a volume plugin at points.
 
-    The plugin promises that no value lies below 0 or above ``max()``, as Mitsuba's own integrators assume.
+    The plugin promises that no value lies above ``max()``, as Mitsuba's own integrators assume. A value below 0 counts as 0,
+    with the derivative at 0: its collisions would have negative probabilities.
 
     Args:
         volume: a plugin with ``max()`` and ``eval``. Its values are grey if ``channel_count()`` is 1, else rgb.
@@ -59,7 +60,8 @@ class PluginField:
         it = dr.zeros(mi.Interaction3f, dr.width(p))
         it.p = p
         values = self.volume.eval(it, active)
-        return [dr.select(active, values[channel], 0) for channel in range(self.channels)]
+        rows = (values[channel] for channel in range(self.channels))
+        return [dr.select(active, dr.replace_grad(dr.maximum(dr.detach(row), 0), row), 0) for row in rows]
 
     def accumulate(self, p: mi.Point3f, w: mi.Vector3f, d: list[mi.Float], active: mi.Bool) -> None:
         accumulate_tracked(self, p, w, d, active)

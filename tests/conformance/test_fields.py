@@ -107,3 +107,17 @@ def test_accumulate_is_the_transpose_of_eval(name: str) -> None:
     assert np.abs(terms).sum() > 100
     by_parameters = sum((a * b).sum() for a, b in zip(v, vjp, strict=True))
     assert abs(terms.sum() - by_parameters) < 1e-5 * np.abs(terms).sum()
+
+
+def test_values_below_0_of_a_volume_known_at_points_count_as_0(variant_rgb: str) -> None:
+    """Of a gridvolume of the nearest voxels: -2, 0 and 3, with the derivative of each voxel by itself."""
+    values = np.array([-2.0, 0.0, 3.0], np.float32).reshape(1, 1, 3, 1)
+    volume = mi.load_dict({"type": "gridvolume", "grid": mi.VolumeGrid(values), "filter_type": "nearest"})
+    params = mi.traverse(volume)
+    dr.enable_grad(params["data"])
+    params.update()
+    x = mi.Point3f(mi.Float(1 / 6, 1 / 2, 5 / 6), 0.5, 0.5)
+    (found,) = PluginField(volume).eval(x, mi.Vector3f(0, 0, 1), mi.Bool(True))
+    np.testing.assert_array_equal(found, [0, 0, 3])
+    dr.backward(dr.sum(found))
+    np.testing.assert_array_equal(np.ravel(dr.grad(params["data"])), [1, 1, 1])
