@@ -78,9 +78,10 @@ class OrientedBox:
     def distance(self, point: np.ndarray) -> float:
         """Distance of a point, over the longest edge [1]; 0 inside. For a sheared box, at most the distance."""
         edges = self.corners[[4, 2, 1]] - self.corners[0]
-        # The box of a rectangle has no third edge: least squares leave the way to its plane.
-        inside = np.linalg.lstsq(edges.T, point - self.corners[0])[0]
-        above = point - self.corners[0] - inside @ edges
+        # The box of a rectangle has no third edge: least squares leave the way to its plane. In a box with space nothing is left
+        # but rounding, and inside the distance is 0 exactly.
+        inside, _, rank, _ = np.linalg.lstsq(edges.T, point - self.corners[0])
+        above = point - self.corners[0] - inside @ edges if rank < 3 else np.zeros(3)
         lengths = np.linalg.norm(edges, axis=1)
         away = (inside - np.clip(inside, 0, 1)) * lengths
         return float(np.hypot(np.linalg.norm(away), np.linalg.norm(above)) / lengths.max())

@@ -53,6 +53,7 @@ def test_a_flat_box_has_distances(turn: np.ndarray) -> None:
     flat = box(np.array([-2.0, -1, 0]), np.array([2.0, 1, 0]), turn)
     for point, expected in (([1, 0.5, 0], 0), ([0, 0, 3], 3), ([5, 0, 0], 3), ([5, 0, -4], 5)):
         assert flat.distance(turn @ point) == pytest.approx(expected / 4, abs=1e-12)
+    assert box(np.array([-2.0, -1, -3]), np.array([2.0, 1, 0.1]), turn).distance(turn @ [0.3, 0.7, -0.1]) == 0
 
 
 @pytest.mark.parametrize("axis", range(3))
