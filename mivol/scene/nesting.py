@@ -78,8 +78,8 @@ class OrientedBox:
     def distance(self, point: np.ndarray) -> float:
         """Distance of a point, over the longest edge [1]; 0 inside. For a sheared box, at most the distance."""
         edges = self.corners[[4, 2, 1]] - self.corners[0]
-        # The box of a rectangle has no third edge: least squares leave the way to its plane. In a box with space they would leave
-        # rounding only, and the distance inside is 0 exactly.
+        # The box of a rectangle has no third edge: least squares leave the way to its plane. In a box with space they would
+        # leave rounding only, and the distance inside is 0 exactly.
         inside, _, rank, _ = np.linalg.lstsq(edges.T, point - self.corners[0])
         above = point - self.corners[0] - inside @ edges if rank < 3 else np.zeros(3)
         lengths = np.linalg.norm(edges, axis=1)
