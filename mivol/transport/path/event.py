@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.estimators.lighting.refracted_light import TRANSMITS
+from mivol.transport.estimators.lighting.refracted_light import REFRACTS, TRANSMITS
 from mivol.transport.estimators.lighting.vertex import MediumVertex, MixedVertex, SurfaceVertex, Vertex
 from mivol.transport.estimators.scores import TrackedFactor
 from mivol.transport.estimators.segment import Collision, SegmentEstimate
@@ -83,7 +83,7 @@ TRANSMISSION = int(
 MIRRORS = 0.0
 """Smallest float32. Mitsuba's glass mirrors for numbers up to the reflectance, and then its density is the reflectance."""
 
-GLASS = tuple(int(mi.BSDFFlags.DeltaReflection) | int(kind) for kind in (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null))
+GLASS = REFRACTS, int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.Null)
 """Flags of the BSDFs that only mirror and transmit."""
 
 

@@ -32,7 +32,7 @@ from mivol.transport.estimators.lighting.vertex import Vertex
 from mivol.transport.traversal.random_numbers import fork_state
 from mivol.transport.traversal.rays import FineRay, spawn_ray
 
-__all__ = ["TRANSMITS", "RefractedLighting", "RefractedSamples", "VertexBeforeGlass", "refracts_only"]
+__all__ = ["REFRACTS", "TRANSMITS", "RefractedLighting", "RefractedSamples", "VertexBeforeGlass", "refracts_only"]
 
 
 FAR = 1e4
