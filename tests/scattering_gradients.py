@@ -11,6 +11,7 @@ import pytest
 from false_alarms import Estimate, assert_precise, assert_same_mean, fresh
 from scattering_scenes import Pencils, mivol, rough_grid
 
+from mivol.scene import render_tasks
 from mivol.validate.statistics import Moments
 
 GRID = "smoke.interior_medium.sigma_t.data"
@@ -25,6 +26,15 @@ def watched(scene: mi.Scene, key: str) -> tuple[mi.SceneParameters, object]:
     params[key] = variable
     params.update()
     return params, variable
+
+
+def note_ways(monkeypatch: pytest.MonkeyPatch, *names: str) -> list[str]:
+    """A list to which functions of :mod:`mivol.scene.render_tasks` with these names add their names when they are called."""
+    ways: list[str] = []
+    for name in names:
+        real = getattr(render_tasks, name)
+        monkeypatch.setattr(render_tasks, name, lambda *args, name=name, real=real: ways.append(name) or real(*args))
+    return ways
 
 
 def vjp(scene: mi.Scene, key: str, w: np.ndarray, spp: int, seed: int, integrator: mi.Integrator) -> np.ndarray:

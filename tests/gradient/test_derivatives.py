@@ -13,11 +13,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from false_alarms import assert_precise, assert_same_mean, difference, fresh
-from scattering_gradients import along, backward, upper_half
+from scattering_gradients import along, backward, note_ways, upper_half
 from scattering_scenes import PLACE, cases, close_up, mivol, rough_grid, sun
 
 from mivol.experiments.script import explain
-from mivol.scene import plan, render_tasks
+from mivol.scene import plan
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import build_estimators, make_plan
 from mivol.scene.survey import survey_scene
@@ -358,11 +358,7 @@ and a traced boundary."""
 @pytest.fixture
 def walked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The ways by which derivatives are found."""
-    ways: list[str] = []
-    for name in ("replay_branches", "carry_tangents"):
-        real = getattr(render_tasks, name)
-        monkeypatch.setattr(render_tasks, name, lambda *args, name=name, real=real: ways.append(name) or real(*args))
-    return ways
+    return note_ways(monkeypatch, "replay_branches", "carry_tangents")
 
 
 def assert_tangents_are_replays(scene: mi.Scene, key: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from false_alarms import Estimate, assert_precise, assert_same_mean, difference, fresh
-from scattering_gradients import BATCHES, backward, upper_half
+from scattering_gradients import BATCHES, backward, note_ways, upper_half
 from scattering_scenes import PLACE, cases, close_up, mivol, rough_grid, sun
 
 from mivol.scene import render_tasks
@@ -61,11 +61,7 @@ WEIGHT = np.full((8, 8, 3), 1 / 192)
 @pytest.fixture
 def walked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The ways by which derivatives are found."""
-    ways: list[str] = []
-    for name in ("replay_branches", "collect_albedo_derivatives"):
-        real = getattr(render_tasks, name)
-        monkeypatch.setattr(render_tasks, name, lambda *args, name=name, real=real: ways.append(name) or real(*args))
-    return ways
+    return note_ways(monkeypatch, "replay_branches", "collect_albedo_derivatives")
 
 
 @pytest.mark.usefixtures("traced_balls")
