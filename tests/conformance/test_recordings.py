@@ -578,8 +578,9 @@ def test_shapes_move_without_another_recording(name: str) -> None:
     make, key, differentiated = MOVED_SHAPES[name]
     pair, counts = Pair(make(), 3), []
     start = dr.detach(pair.params[key])
-    for x in (0.0, 0.05, 0.1, 0.12, 0.03, 0.06, 0.02, 0.04, 0.01, 0.08, 0.07, 0.09):
-        place_shape(pair, key, start, x)
+    for sixteenths in (0, 0.75, 1.5, 2, 0.5, 1, 0.25, 1.25, 1.75, 2.25, 2.5, 2.75):
+        # Sums are exact, so that boxes are equal, or not, whatever the processor rounds.
+        place_shape(pair, key, start, sixteenths / 16)
         pair.gradient(pair.recorded, differentiated, 1)
         counts.append(pair.recordings.count)
     assert counts[7] == counts[11] > 0 and not any(pair.recordings.failures.values())
