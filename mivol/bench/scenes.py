@@ -192,7 +192,7 @@ def box_scene(values: np.ndarray, side: int, albedo: float | Sequence[float] = 0
     """A box with an extinction, seen by a camera of the tutorial.
 
     Args:
-        values: extinction (Z, Y, X), or (3,) of a homogeneous rgb medium [1/length].
+        values: extinction (Z, Y, X), rgb (Z, Y, X, 3), or (3,) of a homogeneous rgb medium [1/length].
         side: edge of the image [pixels].
         albedo: albedo of the medium; rgb for an rgb extinction.
         more: ``phase`` of the medium, ``bsdf`` of the box, and parts of the scene. A scene without parts gets a sky of
@@ -211,9 +211,10 @@ def box_scene(values: np.ndarray, side: int, albedo: float | Sequence[float] = 0
 
 
 def grid_medium(values: np.ndarray, albedo: float) -> dict:
-    """A medium whose extinction is a grid (Z, Y, X) [1/length]."""
+    """A medium whose extinction is a grid, (Z, Y, X) or (Z, Y, X, 3) [1/length]."""
     to_world = mi.ScalarTransform4f(np.float32(TO_WORLD))
-    grid = {"type": "gridvolume", "grid": mi.VolumeGrid(values[..., None]), "raw": True, "to_world": to_world}
+    nodes = mi.VolumeGrid(values if values.ndim == 4 else values[..., None])
+    grid = {"type": "gridvolume", "grid": nodes, "raw": True, "to_world": to_world}
     return {"type": "heterogeneous", "sigma_t": grid, "albedo": albedo}
 
 

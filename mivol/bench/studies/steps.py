@@ -22,7 +22,8 @@ chair: steps of the last stage of a fit of the chair (400 pixels, preset ``cpu``
 step), with their processor time.
 
 The scene ``tutorial`` is the smoke of the Mitsuba tutorial under a sky at depth 6; ``tutorial_sun`` is the same smoke with the
-phase function ``hg`` under a sun in a sky. The other scenes are scenes of the study ``everyday``.
+phase function ``hg`` under a sun in a sky; ``tutorial_rgb`` has an extinction for each colour there. A point light
+shines in thin smoke on a fine grid in ``lamp_in_thin_smoke``. The other scenes are scenes of the study ``everyday``.
 
 fits: a step of the fit loop with its optimizer, schedule, priors and record, on tiny models: the density of ``tutorial`` with
 Adam (also through ``prbvolpath``), a radiance field of 24^3 nodes (256 rays a step) and 256 Gaussians, both from photographs
@@ -53,7 +54,7 @@ from mivol.bench.harness.contests import Stopwatch
 from mivol.bench.harness.figures import new_figure, use_plain_ticks
 from mivol.bench.harness.study import AT_LEAST, AT_MOST, Bar, Question, Size, Study, amount, ask, judge, say_row
 from mivol.bench.photo_fits import PhotoSize, find_photographs, prepare_fit
-from mivol.bench.scenes import box_scene, smoke, sun_and_sky
+from mivol.bench.scenes import box_scene, made_up, point_light, smoke, sun_and_sky
 from mivol.bench.studies.everyday import EverydayScene, chosen_scenes
 from mivol.errors import MivolError
 from mivol.experiments.gaussian_fit import make_start_cloud
@@ -78,9 +79,20 @@ DENSITY_OF_BOX = "box.interior_medium.sigma_t.data"
 TUTORIAL = EverydayScene(lambda side: box_scene(smoke().values, side, albedo=0.8), 6, 1.0, None, DENSITY_OF_BOX)
 """The scene ``tutorial``."""
 
+
+def _coloured_smoke() -> np.ndarray:
+    """The smoke of the tutorial with an extinction for each colour (Z, Y, X, 3) [1/length]."""
+    return smoke().values[..., None] * np.float32([1.0, 0.6, 0.3])
+
+
 OWN_SCENES = {
     "tutorial": TUTORIAL,
     "tutorial_sun": replace(TUTORIAL, build=lambda side: box_scene(smoke().values, side, albedo=0.8, **sun_and_sky())),
+    "tutorial_rgb": replace(TUTORIAL, build=lambda side: box_scene(_coloured_smoke(), side, albedo=0.8, **sun_and_sky())),
+    "lamp_in_thin_smoke": replace(
+        TUTORIAL,
+        build=lambda side: box_scene(made_up((40, 40, 40), 3.0).values, side, albedo=0.9, **point_light((0.0, 0.1, 0.2))),
+    ),
 }
 """The scenes of this study, by name."""
 
@@ -95,7 +107,7 @@ class StepsSize(Size):
     scenes: tuple[str, ...] = amount(
         ("smoke_sun_map", "smoke_on_floor", "smoke_point_inside", "god_rays", "tissue", "jade_null_sun"),
         ("smoke_on_floor", "jade_null_sun"),
-        "tutorial, tutorial_sun, and scenes of the study everyday",
+        f"{', '.join(OWN_SCENES)}, and scenes of the study everyday",
     )
     sides: tuple[int, ...] = amount((4, 16, 64), (4,), "edges of the image [pixels]")
     spp: tuple[int, ...] = amount((1,), doc="samples per pixel of a step")
