@@ -305,8 +305,8 @@ def choose_flights(medium: MediumFacts, segment: str) -> Choice | None:
     if medium.extinction == "rgb":
         return Choice(
             subject,
-            "exact, with one sampled channel per flight",
-            "rgb extinction: weights use the optical depth of all channels",
+            "delta tracking, with one sampled channel per flight",
+            "majorants of blocks are known; tentative collisions weigh all channels",
         )
     return Choice(subject, "delta tracking", "majorants of blocks are known; derivatives walk every cell")
 

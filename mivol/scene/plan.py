@@ -398,7 +398,7 @@ def read_parts(needs: Needs, plan: Plan, survey: SceneSurvey, for_images: bool) 
     skips_empty, trims, estimates_shadows, flies, near = plan.readings(for_images)
     media = zip(needs.boundaries, needs.views, skips_empty, trims, estimates_shadows, strict=True)
     return [
-        [read_part(p, survey, boundary.name, skip, trim, tracks or (flies and p.channels == 1), near) for p in view.parts]
+        [read_part(p, survey, boundary.name, skip, trim, tracks or flies, near) for p in view.parts]
         for boundary, view, skip, trim, tracks in media
     ]
 

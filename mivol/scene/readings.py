@@ -246,7 +246,7 @@ def read_part(
     if draws_near_light:
         coarse = read_coarse_grid(survey, lattice, block_shift(lattice.res), False).lattice
         reading.rough, reading.rough_distances = coarse.values, coarse.empty_distances
-        if part.channels == 1:
+        if not (mi.is_monochromatic and part.channels > 1):
             reading.largest = read_largest(part, survey, name)
     return reading
 

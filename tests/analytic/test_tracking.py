@@ -19,7 +19,7 @@ from scattering_scenes import PLACE, aimed, assert_same_images, cases, close_up,
 import scenes
 from mivol.experiments.script import explain
 from mivol.transport.estimators.flights import tracking
-from mivol.transport.estimators.flights.free_flight import FreeFlight, _channel_probabilities
+from mivol.transport.estimators.flights.free_flight import FreeFlight, _channel_probabilities, regular_tracking
 from mivol.transport.estimators.flights.tracking import (
     LOOKUP_RATE,
     delta_tracking,
@@ -93,7 +93,7 @@ def estimates(lattice: Lattice, scale: float = 1.0, rate: float | None = None) -
     if rate is None:
         found, _ = residual_ratio_tracking(lattice, segment, mi.Float(scale), rng, on)
     else:
-        found = [ratio_tracking_in_grid(lattice, segment, mi.Float(scale), mi.Float(rate), rng, on)[0]]
+        found, _ = ratio_tracking_in_grid(lattice, segment, mi.Float(scale), mi.Float(rate), rng, on)
     exact = integrate_segment(lattice, lattice.values.array, segment)
     T = [np.exp(-scale * np.array(t, dtype=np.float64)[:RAYS]) for t in exact]
     return np.array([np.array(f, dtype=np.float64).reshape(REPEATS, RAYS) for f in found]), np.array(T)
@@ -124,7 +124,7 @@ def test_estimates_have_the_exact_mean(name):
 
 @pytest.mark.slow_for("rough")
 @pytest.mark.statistical
-@pytest.mark.parametrize("name", ["rough", "edges", "a sheet of voxels", "tau 1e-3"])
+@pytest.mark.parametrize("name", ["rough", "edges", "a sheet of voxels", "tau 1e-3", "rgb"])
 def test_look_ups_have_the_exact_mean(name):
     """With a scale, at the smallest rate, of which the values reach all."""
     values = FIELDS[name]()
@@ -146,7 +146,7 @@ def test_look_ups_leave_out_lanes_that_are_off():
     lattice, (o, d) = grid(FIELDS["rough"]()), (mi.Point3f(0, 0, -5), mi.Vector3f(0, 0, 1))
     segment = clip_to_grid(lattice, o, d, 0, dr.inf)
     on = mi.Bool([True, False])
-    T, _ = ratio_tracking_in_grid(lattice, segment, mi.Float(1), mi.Float(1e3), seed_pcg32(start(0.1), 2), on)
+    (T,), _ = ratio_tracking_in_grid(lattice, segment, mi.Float(1), mi.Float(1e3), seed_pcg32(start(0.1), 2), on)
     assert T[0] < 1 and T[1] == 1
 
 
@@ -280,7 +280,7 @@ def lane_generators(seed: int) -> mi.UInt32:
 def fly(part: GridExtinction, interval: RayInterval, seed: int) -> mi.Float64:
     """Distances of collisions; the first number of each lane's generator is that of the first tentative collision."""
     rng, (u,) = draw_pcg32(lane_generators(seed), 1)
-    return delta_tracking_in_blocks(part, mi.Float(SCALE), interval, u, rng)[0]
+    return delta_tracking_in_blocks(part, mi.Float(SCALE), interval, mi.UInt32(0), u, rng)[0]
 
 
 def make_grid(values: np.ndarray, shift: int) -> GridExtinction:
@@ -323,6 +323,38 @@ def test_flights_through_a_grid(shift):
     t = fly(make_grid(values, shift), ray_interval(), 1)
     T = np.exp(-SCALE * tau_twin(values, PLACE, START, D)[0])
     assert_flights(t, depths(values, t, 0.0), T)
+
+
+def rgb_grid() -> np.ndarray:
+    """Rough values of three channels, of which each is the largest somewhere."""
+    rough = np.concatenate([rough_grid(seed, 2.0, (9, 12, 17)) for seed in (1, 2, 3)], axis=-1)
+    return rough * as_float32([0.3, 1.0, 0.6])
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("inverts", [False, True])
+def test_densities_of_flights_weigh_every_channel(inverts: bool) -> None:
+    """Flights of a channel drawn for each lane, weighted by a channel's density over the mean density, are flights of it.
+
+    Weights are at most 3, the number of channels.
+    """
+    values, channel = rgb_grid(), dr.arange(mi.UInt32, N) % 3
+    part, rng = make_grid(values, 2), lane_generators(7)
+    rng, (u,) = draw_pcg32(rng, 1)
+    if inverts:
+        t, densities = regular_tracking(part, mi.Float(SCALE), ray_interval(), -dr.log(1 - u), channel)
+    else:
+        t, densities, _ = delta_tracking_in_blocks(part, mi.Float(SCALE), ray_interval(), channel, u, rng)
+    density = np.array(densities, np.float64)
+    assert density.max() <= 1 + 1e-6 and np.all(density.max(axis=0) > 0.999)
+    weights = density / density.mean(axis=0)
+    met = np.isfinite(np.array(t))
+    for k, tau in enumerate(SCALE * tau_twin(values, PLACE, START, D)):
+        opacity, w = -np.expm1(-tau), weights[k]
+        reached = np.where(met, -np.expm1(-depths(values[..., k : k + 1], t, 0.0)), 0)
+        # Optical depths of about 1 are known to 1e-5, and weights of up to 3 to 1e-6 of them.
+        for found, mean in ((w, 1.0), (w * met, opacity), (w * reached, opacity**2 / 2)):
+            assert_same_mean(Moments.from_values(found), mean, rounding=3e-5, what=f"channel {k}")
 
 
 @pytest.mark.statistical
@@ -377,6 +409,30 @@ def test_camera_rays_spread_their_collisions():
     np.testing.assert_array_equal(np.array(first.on), np.isfinite(t))
     np.testing.assert_array_equal(np.array(first.t)[hit], t[hit])
     assert np.mean(np.array(again.t)[hit] == t[hit]) < 0.1
+
+
+def test_camera_rays_spread_their_channels_too() -> None:
+    """A third of the samples of a pixel has each channel; their collisions are spread among the samples of this channel."""
+    values, count = rgb_grid(), 96
+    scene = close_up({"smoke": smoke(values, 0.5)[0], "lamp": point([0, 0, 9.0])[0]}, res=2)
+    flights = FreeFlight(media_of(scene))
+    (part,) = flights.bodies[0].view.parts
+    part.lattice.block_ranges = find_block_ranges(part.lattice.values, 2)
+    sampler = SpreadSampler.of_pixels(mi.Vector2i(3, 5), mi.UInt32(1), dr.arange(mi.UInt32, count), mi.UInt32(count))
+    one = mi.Ray3f(ray().o, ray().d, mi.Float(dr.inf), mi.Float(0), mi.Color0f())
+    many = dr.gather(mi.Ray3f, one, dr.zeros(mi.UInt32, count))
+    with dr.suspend_grad():
+        known = flights.find_first_collision(many, dr.zeros(mi.MediumPtr, count), sampler, dr.full(mi.Bool, True, count))
+    t, tau = np.array(known.t), tau_twin(values, PLACE, START, D)
+    for k in range(3):
+        own = t[32 * k : 32 * k + 32]
+        u = -np.expm1(-depths(values[..., k : k + 1], mi.Float64(own), 0.0) / SCALE)
+        hit = np.flatnonzero(np.isfinite(own))
+        # As for grey extinctions.
+        assert np.all(hit / 32 - 1e-5 < u[hit]) and np.all(u[hit] < (hit + 1) / 32 + 1e-5)
+        assert abs(len(hit) + 32 * np.expm1(-tau[k])) <= 1
+    # The weights of a white medium keep the sum of the throughputs.
+    np.testing.assert_allclose(np.array(known.weight).sum(axis=0), 3, rtol=1e-6)
 
 
 def test_lanes_that_are_off_and_vacuum_have_no_collision():

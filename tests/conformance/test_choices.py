@@ -200,7 +200,7 @@ def test_lighting_of_free_flights():
     [
         (fog(bounded="Ball"), "delta tracking"),
         (fog(resolutions=()), "exact"),
-        (fog(extinction="rgb"), "exact, with one sampled channel per flight"),
+        (fog(extinction="rgb"), "delta tracking, with one sampled channel per flight"),
         (fog(unread=True), "delta tracking"),
         (fog(), "delta tracking"),
     ],

@@ -29,6 +29,7 @@ from mivol.transport.path import derivatives
 from mivol.transport.path.derivatives import count_baseline_paths, count_branches, prepare_derivatives
 from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.walk import Path, PathStart, walk_part
+from mivol.validate.statistics import Moments
 from scenes import ball_of, box_of, camera, centred, grid_volume, medium, skip_recorded_grids_on_a_gpu, sky
 
 MEDIUM = "smoke.interior_medium."
@@ -140,6 +141,21 @@ def test_light_is_linear_in_the_sun(depth: int, replays: list) -> None:
     assert found == pytest.approx(np.sum(light * dL), rel=1e-4)
 
 
+@pytest.mark.statistical
+@pytest.mark.parametrize("fewest", [1, 1 << 30])
+def test_paths_in_a_white_rgb_medium_have_the_light_of_the_sky(fewest: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Everything is as bright as the sky: each channel has a third of the mean, with segments in memory or without."""
+    monkeypatch.setattr(derivatives, "MIN_LISTED", fewest)
+    density = rough_grid(4, 3.0)
+    values = np.concatenate([density, 0.2 * density, 2 * density], axis=-1)
+    interior = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 1.0)
+    lit = {"type": "constant", "radiance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
+    scene = close_up({"smoke": box_of(interior, PLACE), "lit": lit}, res=8)
+    integrator, weight = mi.load_dict(mivol(max_depth=-1, rr_depth=1000)), np.full((8, 8, 3), 1 / 192)
+    found = [backward(scene, "lit.radiance.value", weight, 256, fresh(k), integrator) for k in range(16)]
+    assert_same_mean(Moments.from_values(np.array(found).reshape(16, 3)), 1 / 3, rounding=1e-6, what="light of each channel")
+
+
 @pytest.mark.parametrize("name", cases(SCENES, slow=("rgb", "fire", "glass")))
 def test_listed_probes_add_what_probes_add_in_their_lanes(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same probes with the same random numbers: the same terms in another order."""
@@ -151,15 +167,21 @@ def test_listed_probes_add_what_probes_add_in_their_lanes(name: str, monkeypatch
     np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-5 * np.abs(found[1]).max())
 
 
-def lit_inside(lamp: dict) -> mi.Scene:
+def lit_inside(lamp: dict, rgb: bool = False) -> mi.Scene:
     """A lamp inside of smoke: segments draw its light."""
-    density = grid_volume("mivol_voxels", 0.5 + rough_grid(4, 3.0), PLACE)
+    values = 0.5 + rough_grid(4, 3.0)
+    density = grid_volume("mivol_voxels", np.concatenate([values, 0.3 * values, 2 * values], -1) if rgb else values, PLACE)
     return close_up({"smoke": box_of(medium("mivol_medium", density, 0.8), PLACE), "lamp": lamp}, res=8)
 
 
 BULB = {"type": "point", "position": [0.2, 0.1, 0.3], "intensity": 4.0}
 BALL = {"type": "sphere", "center": [0.2, 0.1, 0.3], "radius": 0.1, "emitter": {"type": "area", "radiance": 30.0}}
-LAMPS = {"density": (BULB, KEYS["density"], 5), "some": (BULB, "lamp.position", 1), "ball": (BALL, KEYS["density"], 5)}
+LAMPS = {
+    "density": (BULB, KEYS["density"], 5),
+    "some": (BULB, "lamp.position", 1),
+    "ball": (BALL, KEYS["density"], 5),
+    "rgb": (BULB, KEYS["density"], 5),
+}
 
 
 @pytest.mark.parametrize("name", cases(LAMPS, slow=("ball",)))
@@ -169,7 +191,7 @@ def test_a_replay_reads_where_the_walk_has_found_near_light(name: str, monkeypat
     monkeypatch.setattr(derivatives, "MIN_LISTED", 1)
     for places in (0, most):
         monkeypatch.setattr(derivatives, "MAX_SEGMENTS", places)
-        found.append(gradient_of_mean_image(lit_inside(lamp), key, 64, fresh(3)))
+        found.append(gradient_of_mean_image(lit_inside(lamp, name == "rgb"), key, 64, fresh(3)))
     # 4096 float32 terms of both signs.
     np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-5 * np.abs(found[0]).max())
 

@@ -75,7 +75,9 @@ def gradient(scene: mi.Scene, key: str | tuple[str, ...], depth: int = 5) -> np.
 
 
 @pytest.mark.usefixtures("traced_balls")
-@pytest.mark.parametrize("name", cases(SCENES, slow=[name for name in SCENES if name not in ("floor", "beside traced fog")]))
+@pytest.mark.parametrize(
+    "name", cases(SCENES, slow=[name for name in SCENES if name not in ("floor", "rgb", "beside traced fog")])
+)
 def test_segments_in_memory_change_no_derivative(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """With no, some or all segments in memory: the same terms in another order."""
     (build, key), found = SCENES[name], []
@@ -116,7 +118,7 @@ def test_boundaries_are_traced_again_for_their_own_derivatives(
 
 def test_what_is_written_is_read() -> None:
     """A collision, an end at a surface, a way out, and a segment without room."""
-    kept = KeptSegments.empty(4, keeps_shadows=True, keeps_places=False, skips_boundaries=True)
+    kept = KeptSegments.empty(4, 1, keeps_shadows=True, keeps_places=False, skips_boundaries=True)
     hit = SimpleNamespace(on=mi.Bool([True, False, False, True]), t=mi.Float64([2, 3, 4, 5]), body=mi.UInt32([1, 0, 0, 0]))
     si = SimpleNamespace(is_valid=lambda: mi.Bool([False, True, False, False]))
     index, room = mi.UInt32([3, 2, 1, 0]), mi.Bool([True, True, True, False])

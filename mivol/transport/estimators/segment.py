@@ -91,16 +91,21 @@ class KnownFlight:
         on: lanes in which the collision is known.
         meets_no_surface: lanes in which no surface lies in front of the collision, or on the whole ray without a collision, so
             nothing is traced; None if unknown.
+        weight: weight of each channel of an rgb extinction at the end of the flight [1]; None in grey scenes, and for
+            collisions at which paths begin.
     """
 
     t: mi.Float64
     body: mi.UInt32
     on: mi.Bool
     meets_no_surface: mi.Bool | None = None
+    weight: mi.Spectrum | None = None
 
     def at(self, index: mi.UInt32, active: mi.Bool) -> KnownFlight:
         """The flights of other lanes, known where ``active``."""
-        return KnownFlight(dr.gather(mi.Float64, self.t, index, active), dr.gather(mi.UInt32, self.body, index, active), active)
+        t, body = dr.gather(mi.Float64, self.t, index, active), dr.gather(mi.UInt32, self.body, index, active)
+        weight = None if self.weight is None else dr.gather(mi.Spectrum, self.weight, index, active)
+        return KnownFlight(t, body, active, weight=weight)
 
     def forget(self) -> KnownFlight:
         """The same in no lane."""

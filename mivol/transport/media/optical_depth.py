@@ -12,7 +12,7 @@ import mitsuba as mi
 
 from mivol.numerics import minimum
 from mivol.transport.media.body import Body
-from mivol.transport.media.extinction import Weight, colours_to_channels, to_spectrum
+from mivol.transport.media.extinction import ExactExtinction, Weight, colours_to_channels, to_spectrum
 from mivol.transport.media.ray_intervals import (
     MediumInterval,
     PointReservoir,
@@ -77,15 +77,20 @@ def integrate_optical_depth(
     return end, tau, passages
 
 
-def segment_optical_depth(media: SceneMedia, segment: RaySegment, active: mi.Bool, exact_only: bool = False) -> list[mi.Float]:
+def segment_optical_depth(
+    media: SceneMedia,
+    segment: RaySegment,
+    active: mi.Bool,
+    parts_of: Callable[[Body], list[ExactExtinction]] | None = None,
+) -> list[mi.Float]:
     """Integrate the optical depth [1] of each channel over a segment of known length.
 
-    With ``exact_only``, parts without a known integral along a ray are left out; otherwise they raise.
+    ``parts_of`` chooses the parts of each medium, with known integrals along a ray; by default all parts.
     """
 
     def add(tau: list[mi.Float], interval: MediumInterval) -> list[mi.Float]:
         body = interval.body
-        own = body.optical_depth(interval, media.channels, body.exact_parts if exact_only else None)
+        own = body.optical_depth(interval, media.channels, None if parts_of is None else parts_of(body))
         return [t + d for t, d in zip(tau, own, strict=True)]
 
     return revisit_media(media, segment, add, [mi.Float(0) for _ in range(media.channels)], active, anywhere=True)

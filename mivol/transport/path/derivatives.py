@@ -208,11 +208,11 @@ def _make_kept_segments(estimators: Estimators, count: int) -> KeptSegments:
     """Memory for segments, with all that replays of these media can read."""
     media, near = estimators.media, estimators.near
     needs_boundaries = any(body.follows_extinction or body.needs_probes for body in media.traced)
-    needs_boundaries |= bool(media.traced) and media.channels > 1
     return KeptSegments.empty(
         count,
-        # One number holds the shadow.
-        keeps_shadows=media.channels == 1 and not media.has_null_transmission,
+        media.channels,
+        # Shadows that surfaces tint are followed again.
+        keeps_shadows=not media.has_null_transmission,
         keeps_places=near is not None and near.has_places,
         # Near light and Gaussians shine up to the surface behind a collision.
         skips_boundaries=not (needs_boundaries or near is not None or any(body.view.shows_gaussians for body in media.bodies)),

@@ -4,7 +4,7 @@ A replay draws the same random numbers, so it finds the same collisions and the 
 grid for a flight and traces no shadow ray of a vertex. It traces a segment only if the segment ends at a surface, or if
 derivatives need the boundaries on the way.
 
-Memory: 12 bytes a segment, 16 with shadows, and 24 more with near light.
+Memory: 12 bytes a segment, 16 with shadows, and 24 more with near light; 36, and 48 more, with an rgb extinction.
 """
 
 from __future__ import annotations
@@ -51,22 +51,25 @@ class KeptSegments:
         body: index of the medium of the collision.
         shadow: transmittance of the shadow ray of the vertex in front of the segment, as in ``DirectSample`` [1]; None if
             replays follow shadow rays again.
+        weight: weight of each channel of an rgb extinction [1]; None in grey scenes.
         places: where segments have found near light; None without near light, or if replays draw it again.
         skips_boundaries: replays need no boundary in front of the end of a segment.
     """
 
     t: mi.Float64
     body: mi.UInt32
-    shadow: mi.Float | None
+    shadow: mi.Float | mi.Spectrum | None
+    weight: mi.Spectrum | None
     places: NearLightPlace | None
     skips_boundaries: bool
 
     @classmethod
-    def empty(cls, count: int, keeps_shadows: bool, keeps_places: bool, skips_boundaries: bool) -> KeptSegments:
-        """Room in memory for many segments."""
-        shadow = dr.empty(mi.Float, count) if keeps_shadows else None
-        places = NearLightPlace.empty(count) if keeps_places else None
-        kept = cls(dr.empty(mi.Float64, count), dr.empty(mi.UInt32, count), shadow, places, skips_boundaries)
+    def empty(cls, count: int, channels: int, keeps_shadows: bool, keeps_places: bool, skips_boundaries: bool) -> KeptSegments:
+        """Room in memory for many segments, in a scene with so many channels of the extinction."""
+        shadow = dr.empty(mi.Float if channels == 1 else mi.Spectrum, count) if keeps_shadows else None
+        places = NearLightPlace.empty(count, channels) if keeps_places else None
+        weight = dr.empty(mi.Spectrum, count) if channels > 1 else None
+        kept = cls(dr.empty(mi.Float64, count), dr.empty(mi.UInt32, count), shadow, weight, places, skips_boundaries)
         dr.eval(kept)
         return kept
 
@@ -76,6 +79,8 @@ class KeptSegments:
         t = dr.select(hit.on, hit.t, dr.select(estimate.end.si.is_valid(), mi.Float64(AT_SURFACE), mi.Float64(dr.inf)))
         dr.scatter(self.t, t, index, active)
         dr.scatter(self.body, hit.body, index, active & hit.on)
+        if self.weight is not None:
+            dr.scatter(self.weight, estimate.T, index, active)
 
     def flight_at(self, index: mi.UInt32, active: mi.Bool, other: KnownFlight) -> KnownFlight:
         """The flights of the segments with an index; in lanes that are not active, the ``other`` flights."""
@@ -84,6 +89,9 @@ class KeptSegments:
         body = dr.gather(mi.UInt32, self.body, index, collides)
         distance = dr.select(collides, t, dr.inf)
         flight = KnownFlight(dr.select(active, distance, other.t), dr.select(active, body, other.body), active | other.on)
+        if self.weight is not None:
+            weight = dr.gather(mi.Spectrum, self.weight, index, active)
+            flight.weight = dr.select(active, weight, 1 if other.weight is None else other.weight)
         if self.skips_boundaries:
             flight.meets_no_surface = active & (t >= 0)
         return flight
@@ -91,8 +99,8 @@ class KeptSegments:
     def set_shadow(self, index: mi.UInt32, T: mi.Spectrum, active: mi.Bool) -> None:
         """Write the shadows of vertices to memory."""
         if self.shadow is not None:
-            dr.scatter(self.shadow, T[0], index, active)
+            dr.scatter(self.shadow, T[0] if isinstance(self.shadow, mi.Float) else T, index, active)
 
-    def shadow_at(self, index: mi.UInt32, active: mi.Bool) -> tuple[mi.Float, mi.Bool] | None:
+    def shadow_at(self, index: mi.UInt32, active: mi.Bool) -> tuple[mi.Float | mi.Spectrum, mi.Bool] | None:
         """The shadows of the vertices with an index, and the lanes with a shadow; None without shadows."""
-        return None if self.shadow is None else (dr.gather(mi.Float, self.shadow, index, active), active)
+        return None if self.shadow is None else (dr.gather(type(self.shadow), self.shadow, index, active), active)

@@ -204,7 +204,10 @@ class PathStart:
             *(write(values) for values in (self.medium, self.beta, self.eta, self.depth)),
             SpreadSampler(*(write(values) for values in (sampler.bits, sampler.state, sampler.lead))),
             write(self.active),
-            KnownFlight(*(write(values) for values in (flight.t, flight.body, flight.on))),
+            KnownFlight(
+                *(write(values) for values in (flight.t, flight.body, flight.on)),
+                weight=None if flight.weight is None else write(flight.weight),
+            ),
             write(self.at_collision),
             self.number and SegmentNumber(write(self.number.index), write(self.number.left)),
         )
@@ -443,7 +446,7 @@ def advance_path(estimators: Estimators, path: Path, collision: Collision | None
     path = _scatter(estimators, path, event)
     if stopped is not None:
         path.ray, path.beta = dr.select(stopped, ray, path.ray), dr.select(stopped, beta, path.beta)
-        path.known = dr.select(stopped, KnownFlight(hit.t, hit.body, stopped), path.known)
+        path.known = dr.select(stopped, replace(path.known, t=hit.t, body=hit.body, on=stopped), path.known)
     return path
 
 

@@ -9,6 +9,14 @@ With an rgb extinction, one channel is drawn for the flight in proportion to the
 all channels weights the outcome (the balance heuristic). In a medium of albedo 1 these weights preserve the sum of the
 throughputs, so they stay bounded on paths of any length.
 
+.. math:: w_k = \frac{F_k}{\sum_c p_c F_c}, \qquad F_k = \sigma_k T_k \quad\text{or}\quad
+          F_k = \frac{\sigma_k(x)}{M} \prod_j \Big(1 - \frac{\sigma_k(x_j)}{M_j}\Big)
+
+The first F is exact, and needs a second walk of a grid. Delta tracking at one rate M for all channels has the second: the
+density of all tentative collisions. Its mean over the points x_j is the first, so terms and derivatives that depend on the
+collision alone have the same means with either. A flight may have gone on behind the collision with another medium; its density
+then has the same mean as well.
+
 One point of each flight, drawn uniformly over its length t, samples the emission j: the mean of t j over all flights is
 :math:`\int T j\,dt`, also in regions without extinction. The light of Gaussians is summed (:mod:`.gaussian_light`).
 
@@ -31,7 +39,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -41,7 +48,12 @@ from mivol.numerics import fast_max, fast_min, minimum
 from mivol.transport.estimators.flights.baseline import Baseline
 from mivol.transport.estimators.flights.flight_derivatives import FlightSegment
 from mivol.transport.estimators.flights.gaussian_light import GaussianLight
-from mivol.transport.estimators.flights.tracking import delta_tracking, delta_tracking_in_blocks
+from mivol.transport.estimators.flights.tracking import (
+    delta_tracking,
+    delta_tracking_in_blocks,
+    scale_to_largest,
+    select_channel,
+)
 from mivol.transport.estimators.scores import IMAGE
 from mivol.transport.estimators.segment import (
     Collision,
@@ -62,7 +74,12 @@ from mivol.transport.media.extinction import (
     to_spectrum,
 )
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
-from mivol.transport.media.grid_extinction import activate, clip_interval
+from mivol.transport.media.grid_extinction import (
+    ActivatedGridExtinction,
+    GridExtinction,
+    activate,
+    clip_interval,
+)
 from mivol.transport.media.octree_extinction import OctreeExtinction
 from mivol.transport.media.optical_depth import segment_optical_depth
 from mivol.transport.media.ray_intervals import (
@@ -77,6 +94,7 @@ from mivol.transport.media.ray_intervals import (
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.grid_walk import Cell, NodeArray, corner_nodes, read_nodes, walk_cells
 from mivol.transport.traversal.interpolation import (
+    eval_cubic,
     fit_cubic,
     gauss_points,
     integrate_cubic,
@@ -87,6 +105,9 @@ from mivol.transport.traversal.lattice import points_of_piece
 from mivol.transport.traversal.random_numbers import SpreadSampler, draw_lead, draw_pcg32, draw_state
 from mivol.transport.traversal.rays import Ray, point_along
 
+ALMOST_ONE = 1 - 2.0**-24
+"""Largest number below 1 in float32."""
+
 __all__ = ["FreeFlight", "make_collision", "regular_tracking", "sample_gaussian_flight"]
 
 
@@ -96,7 +117,7 @@ def regular_tracking(
     interval: RayInterval,
     goal: mi.Float,
     channel: mi.UInt32,
-) -> mi.Float64:
+) -> tuple[mi.Float64, list[mi.Float]]:
     """Find the first collision with a constant or a grid on an interval of a ray.
 
     Args:
@@ -107,20 +128,21 @@ def regular_tracking(
         channel: channel of an rgb extinction.
 
     Returns:
-        Distance of the collision on the ray [length]; infinite without a collision.
+        Distance of the collision on the ray [length], infinite without a collision; and the density of the flight for each
+        channel of an rgb grid, relative to the largest [1] (empty for other parts).
 
     Bias: none, except for an extinction with an activation, interpolated by a cubic through four points of a cell. Cost: one
     walk up to the collision.
     """
     if part.is_constant:
-        return _collide_in_constant(part, scale, interval, goal, channel)
+        return _collide_in_constant(part, scale, interval, goal, channel), []
     return _collide_in_grid(part, scale, interval, goal, channel)
 
 
 def _collide_in_constant(
     part: ExactExtinction, scale: mi.Float, interval: RayInterval, goal: mi.Float, channel: mi.UInt32
 ) -> mi.Float64:
-    sigma = _select_channel(part.eval_at(scale, interval.ray, interval.t0, interval.active), channel)
+    sigma = select_channel(part.eval_at(scale, interval.ray, interval.t0, interval.active), channel)
     t = mi.Float64(interval.t0) + mi.Float64(goal / sigma)
     return dr.select(interval.active & (sigma > 0) & (t < interval.t1), t, dr.inf)
 
@@ -131,43 +153,56 @@ def _collide_in_grid(
     interval: RayInterval,
     goal: mi.Float,
     channel: mi.UInt32,
-) -> mi.Float64:
+) -> tuple[mi.Float64, list[mi.Float]]:
     lattice, ray = part.lattice, interval.ray
-    segment, width = clip_interval(lattice, interval), dr.width(ray)
+    segment, width, is_rgb = clip_interval(lattice, interval), dr.width(ray), _has_densities(part)
     reads = [NodeArray(dr.detach(part.values), part.channels)]
 
+    def extinction_at(corners: list[list[mi.Float]], p: mi.Vector3f) -> list[mi.Float]:
+        """The extinction at a point of a cell, without the scale: of each channel, or of the only one."""
+        rows = corners if is_rgb else [[select_channel([row[q] for row in corners], channel) for q in range(8)]]
+        return [activate(part.activation, interpolate(row, p)) for row in rows]
+
     def visit(state: tuple, cell: Cell, on: mi.Bool) -> tuple:
-        remaining, s, dt, collides = state
-        corners = [_select_channel([row[q] for row in cell.corners[0]], channel) for q in range(8)]
-        a, b = (activate(part.activation, interpolate(corners, p)) for p in gauss_points(cell))
-        tau = 0.5 * cell.dt * scale * (a + b)
+        remaining, s, dt, collides, passed = state
+        ends_of_cell = (extinction_at(cell.corners[0], p) for p in gauss_points(cell))
+        taus = [0.5 * cell.dt * scale * (a + b) for a, b in zip(*ends_of_cell, strict=True)]
+        tau = select_channel(taus, channel) if is_rgb else taus[0]
         ends = on & (tau >= remaining)
         s, dt = dr.select(ends, cell.s, s), dr.select(ends, cell.dt, dt)
-        return dr.select(on & ~ends, remaining - tau, remaining), s, dt, collides | ends
+        passed = [dr.select(on & ~ends, t + own, t) for t, own in zip(passed, taus, strict=False)]
+        return dr.select(on & ~ends, remaining - tau, remaining), s, dt, collides | ends, passed
 
     zero = dr.zeros(mi.Float, width)
-    start = (mi.Float(goal), zero, zero, dr.full(mi.Bool, False, width))
-    remaining, s, dt, collides = walk_cells(
+    passed = [dr.zeros(mi.Float, width) for _ in range(part.channels)] if is_rgb else []
+    start = (mi.Float(goal), zero, zero, dr.full(mi.Bool, False, width), passed)
+    remaining, s, dt, collides, passed = walk_cells(
         lattice, segment, visit, start, reads, interval.active, until=lambda state: state[3]
     )
 
     # -- The position of the collision inside its cell ---------------------------------------------------------------------
     begin = segment.start + mi.Float64(s)
     cell, points, inside = points_of_piece(lattice, ray, begin, dt, collides)
-    rows = read_nodes(reads, corner_nodes(cell, lattice, inside), inside)[0]
-    corners = [_select_channel([row[q] for row in rows], channel) for q in range(8)]
-    curve = fit_cubic(*(scale * activate(part.activation, interpolate(corners, p)) for p in points))
+    corners = read_nodes(reads, corner_nodes(cell, lattice, inside), inside)[0]
+    columns = [extinction_at(corners, p) for p in points]
+    curves = [fit_cubic(*(scale * value for value in row)) for row in zip(*columns, strict=True)]
+    curve = [select_channel(list(c), channel) for c in zip(*curves, strict=True)] if is_rgb else curves[0]
     x = invert_cubic_integral(curve, dt, remaining, integrate_cubic(curve, dt, mi.Float(1)))
-    return dr.select(collides, begin + mi.Float64(x) * mi.Float64(dt), dr.inf)
+    t = dr.select(collides, begin + mi.Float64(x) * mi.Float64(dt), dr.inf)
+    if not is_rgb:
+        return t, []
+
+    # -- The density of the flight in each channel -------------------------------------------------------------------------
+    tau = [p + dr.select(collides, integrate_cubic(c, dt, x), 0) for p, c in zip(passed, curves, strict=True)]
+    least = minimum(tau)
+    sigma = [dr.select(collides, dr.maximum(eval_cubic(c, x), 0), 1) for c in curves]
+    return t, scale_to_largest([dr.exp(least - depth) * value for depth, value in zip(tau, sigma, strict=True)])
 
 
-def _select_channel(rows: list[mi.Float], channel: mi.UInt32) -> mi.Float:
-    """Select the value of a channel; a grey part has one channel, and a mono variant uses the luminance of three."""
-    rows = to_scene_channels(rows, 1) if mi.is_monochromatic else rows
-    value = rows[0]
-    for k, row in enumerate(rows[1:], 1):
-        value = dr.select(channel == k, row, value)
-    return value
+def _has_densities(part: Extinction) -> bool:
+    """Whether a flight through the part finds its density in each channel: in rgb grids."""
+    is_grid = isinstance(part, GridExtinction | ActivatedGridExtinction)
+    return is_grid and part.channels > 1 and not mi.is_monochromatic
 
 
 def sample_gaussian_flight(
@@ -218,6 +253,8 @@ class _Flight:
         u: uniform random number of the next flight, in [0, 1).
         rng: state of the random number generator.
         passages: length up to the collision in each of ``media.traced``, as in ``RaySegment``.
+        densities: density of the flights through rgb grids in each channel, relative to the largest [1]; empty without them.
+        has_density: lanes whose collision is in one of these grids.
     """
 
     t: mi.Float64
@@ -225,6 +262,8 @@ class _Flight:
     u: mi.Float
     rng: mi.UInt32
     passages: list[mi.Float] | None
+    densities: list[mi.Float]
+    has_density: mi.Bool
 
 
 class FreeFlight:
@@ -239,8 +278,8 @@ class FreeFlight:
         emitting: media with an emission by position.
         has_gaussian_light: a medium of Gaussians emits light.
 
-    Bias: none. Variance: one flight a segment. Cost: a walk of each medium to the first collision; one more walk for an rgb
-    extinction or an emitting medium.
+    Bias: none. Variance: one flight a segment; in rgb grids with block ranges, tentative collisions too. Cost: a walk of each
+    medium to the first collision; one more for an emitting medium, and for an octree of an rgb extinction.
     """
 
     ends_in_media = True
@@ -273,13 +312,23 @@ class FreeFlight:
 
         Bias: as of :func:`regular_tracking`. Cost: one walk up to the collision.
         """
-        parts = [part for body in self.bodies for part in body.view.parts]
-        # With an rgb extinction the throughput of the path draws the channel of the flight, and is not known yet.
-        if self.media.channels > 1 or not any(part.exact_line and _uses_delta_tracking(part) for part in parts):
+        media = self.media
+        if not any(_tracks_grid(part) for body in self.bodies for part in body.view.parts):
             return None
         u, rng = self.draw(sampler, active)
-        _, flight = _find_first_collision(self.media, ray, medium, u, mi.UInt32(0), rng, active, inverts=True)
-        return KnownFlight(flight.t, flight.body, active)
+        if media.channels == 1:
+            _, flight = _find_first_collision(media, ray, medium, u, mi.UInt32(0), rng, active, inverts=True)
+            return KnownFlight(flight.t, flight.body, active)
+        # The number that is spread over the samples of a pixel spreads their channels too.
+        scaled = u * media.channels
+        channel = dr.minimum(mi.UInt32(scaled), media.channels - 1)
+        u = dr.minimum(scaled - channel, ALMOST_ONE)
+        end, flight = _find_first_collision(media, ray, medium, u, channel, rng, active, inverts=True)
+        collides = active & (flight.t < mi.Float64(end.t))
+        passed = RaySegment.upto(ray, medium, dr.select(collides, flight.t, mi.Float64(end.t)), flight.passages)
+        collision = make_collision(media, ray, flight.t, flight.body, collides)
+        weight = _weigh_channels(media, mi.Spectrum(1), passed, collision, flight, active)
+        return KnownFlight(flight.t, flight.body, active, weight=weight)
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """Needs no preparation here: the path estimates the baseline (:mod:`mivol.transport.path.derivatives`)."""
@@ -306,17 +355,27 @@ class FreeFlight:
             # One point of the flight estimates the derivatives of bounded media.
             _, (passed.u,) = draw_pcg32(flight.rng, 1)
         collision = make_collision(media, ray, flight.t, flight.body, collides)
-        weight = self._channel_weight(segment, passed, active, collision)
+        weight = mi.Spectrum(1)
+        if media.channels > 1:
+            known = segment.known
+            is_known = mi.Bool(False) if known is None or known.weight is None else active & known.on
+            weight = _weigh_channels(media, segment.beta, passed, collision, flight, active & ~is_known)
+            if known is not None and known.weight is not None:
+                # Paths that begin at a collision have its weight in their throughput already, and are not active.
+                weight = dr.select(is_known, known.weight, weight)
         # -- The light of the media on the way --------------------------------------------------------------------------
         emission = None
         if self.emitting:
-            emission = self._sample_point(segment, passed, self.emitting, at_emission, active)
+            emission = self._sample_point(segment, passed, self.emitting, at_emission, active, weight)
         if segment.emission_weight is not None:
             emission.gain *= segment.emission_weight
         gaussian_light = None
         if self.has_gaussian_light:
-            channel_weight = partial(self._channel_weight, segment, collision=None)
-            gaussian_light = GaussianLight(media, segment, (end.t, t), channel_weight, active)
+
+            def weigh(front: RaySegment, on: mi.Bool) -> mi.Spectrum:
+                return _weigh_channels(media, segment.beta, front, None, None, on)
+
+            gaussian_light = GaussianLight(media, segment, (end.t, t), weigh, active)
         # -- Term, factor, and the point for derivatives ----------------------------------------------------------------
         # The path's own flights and probes account for the baseline; a side flight has none.
         baseline = None if segment.is_side_flight else self.baseline
@@ -326,41 +385,74 @@ class FreeFlight:
         if purpose == IMAGE:
             return SegmentEstimate(end, weight, light, transmittance, collision)
         probed = [body for body in self.bodies if body.needs_probes]
-        probe = self._sample_point(segment, passed, probed, at_probe, active) if probed else None
+        probe = self._sample_point(segment, passed, probed, at_probe, active, weight) if probed else None
         return SegmentEstimate(end, weight, light, transmittance, collision, probe, chance)
 
-    def _channel_weight(
-        self, segment: PathSegment, passed: RaySegment, active: mi.Bool, collision: Collision | None
-    ) -> mi.Spectrum:
-        """The weight of each channel: its value over the mean density over the channels, in proportion to their throughputs.
-
-        Args:
-            segment: segment of the path, with its throughput.
-            passed: ray up to the end of the flight.
-            active: lanes that fly.
-            collision: collision at the end; None means the probability of flying this far.
-        """
-        if self.media.channels == 1:
-            return mi.Spectrum(1)
-        # Only ratios of transmittances matter; the largest becomes 1. Bounded parts are grey, and cancel.
-        tau = segment_optical_depth(self.media, passed, active, exact_only=True)
-        least = minimum(tau)
-        value = to_spectrum([dr.exp(least - row) for row in tau])
-        hits = [] if collision is None else self.media.bodies_at(collision.body, collision.on)
-        for body, on in hits:
-            value = dr.select(on, value * _eval_extinction(self.media, body, segment.ray, collision.t, on), value)
-        shares = _channel_probabilities(segment.beta)
-        density = sum((p * v for p, v in zip(shares, to_components(value), strict=True)), mi.Float(0))
-        return dr.select(density > 0, value / dr.select(density > 0, density, 1), 0)
-
     def _sample_point(
-        self, segment: PathSegment, passed: RaySegment, among: list[Body], u: mi.Float, active: mi.Bool
+        self,
+        segment: PathSegment,
+        passed: RaySegment,
+        among: list[Body],
+        u: mi.Float,
+        active: mi.Bool,
+        weight: mi.Spectrum,
     ) -> FlightPoint:
-        """Draw a point uniformly from the intervals of a flight in some media."""
+        """Draw a point uniformly from the intervals of a flight in some media; ``weight``: of each channel, at the end of the
+        flight."""
         point = draw_uniform_point(self.media, passed, among, u, active)
-        front = RaySegment.upto(segment.ray, segment.medium, dr.select(point.on, point.t, 0))
-        gain = segment.beta * self._channel_weight(segment, front, point.on, None) * point.length
-        return FlightPoint(point, gain)
+        # The mean of the weights over the ends of all flights that pass the point is the weight at the point.
+        return FlightPoint(point, segment.beta * weight * point.length)
+
+
+def _weigh_channels(
+    media: SceneMedia,
+    beta: mi.Spectrum,
+    passed: RaySegment,
+    collision: Collision | None,
+    flight: _Flight | None,
+    active: mi.Bool,
+) -> mi.Spectrum:
+    """The weight of each channel: its density over the mean density of the channels, in proportion to their throughputs.
+
+    Args:
+        media: media of the scene.
+        beta: throughput at the start [1].
+        passed: ray up to the end of the flight.
+        collision: collision at the end; None means the probability of flying this far.
+        flight: the flight, with its densities in grids; None if they are not known.
+        active: lanes to weigh.
+    """
+    value = mi.Spectrum(1) if flight is None or not flight.densities else to_spectrum(flight.densities)
+
+    def left(body: Body) -> list[Extinction]:
+        return [part for part in body.view.parts if flight is None or not _has_densities(part)]
+
+    def exact(body: Body) -> list[ExactExtinction]:
+        return [part for part in left(body) if part.exact_line]
+
+    # Grey and bounded parts have the same transmittance in each channel, and media of such parts alone the same density.
+    coloured = [body for body in media.bodies if any(part.channels > 1 for part in left(body))]
+    if coloured:
+        # Only ratios of transmittances matter; the largest becomes 1.
+        tau = segment_optical_depth(media, passed, active, exact)
+        least = minimum(tau)
+        value *= to_spectrum([dr.exp(least - row) for row in tau])
+        hits = [] if collision is None else media.bodies_at(collision.body, collision.on & ~flight.has_density & active)
+        for body, on in hits:
+            if any(body is other for other in coloured):
+                value = dr.select(on, value * _eval_parts(media, left(body), passed.ray, collision.t, on), value)
+    shares = _channel_probabilities(beta)
+    density = sum((p * v for p, v in zip(shares, to_components(value), strict=True)), mi.Float(0))
+    return dr.select(density > 0, value / dr.select(density > 0, density, 1), 0)
+
+
+def _eval_parts(media: SceneMedia, parts: list[Extinction], ray: Ray, t: mi.Float64, on: mi.Bool) -> mi.Spectrum:
+    """Sum of some parts of a medium, without its scale [1/length]."""
+    total = mi.Spectrum(0)
+    for part in parts:
+        rows = part.eval_at(mi.Float(1), ray, dr.select(on, t, 0), on)
+        total += to_spectrum(to_scene_channels(rows, media.channels))
+    return total
 
 
 def make_collision(media: SceneMedia, ray: Ray, t: mi.Float64, body: mi.UInt32, on: mi.Bool) -> Collision:
@@ -419,6 +511,7 @@ def _find_first_collision(
 
     def visit(flight: _Flight, interval: MediumInterval) -> _Flight:
         body, t, index, u, rng = interval.body, flight.t, flight.body, flight.u, flight.rng
+        densities, has_density = flight.densities, flight.has_density
         number = next(k for k, other in enumerate(bodies) if other is body)
         scale = dr.detach(body.view.scale) * body.area(ray.d)
         for part in body.view.parts:
@@ -436,20 +529,26 @@ def _find_first_collision(
                 rng, (other,) = draw_pcg32(rng, 1)
                 u = dr.select(ahead.active, other, u)
             else:
-                if _uses_delta_tracking(part) and not inverts:
-                    hit, rng = delta_tracking_in_blocks(part, scale, ahead, u, rng)
+                if _tracks_grid(part) and not inverts:
+                    hit, found, rng = delta_tracking_in_blocks(part, scale, ahead, channel, u, rng)
                 else:
-                    hit = regular_tracking(part, scale, ahead, -dr.log(1 - u), channel)
+                    hit, found = regular_tracking(part, scale, ahead, -dr.log(1 - u), channel)
+                if found:
+                    densities = scale_to_largest([d * f for d, f in zip(densities, found, strict=True)])
                 # The first flight takes the spread number of the segment. Each other part, and each further entry into a
                 # traced boundary, needs its own.
                 rng, (other,) = draw_pcg32(rng, 1)
                 u = dr.select(ahead.active, other, u)
             nearer = ahead.active & (hit < t)
             t, index = dr.select(nearer, hit, t), dr.select(nearer, mi.UInt32(number), index)
-        return _Flight(t, index, u, rng, add_passage(media, flight.passages, interval, t))
+            has_density = dr.select(nearer, _has_densities(part), has_density)
+        return _Flight(t, index, u, rng, add_passage(media, flight.passages, interval, t), densities, has_density)
 
     width = dr.width(ray)
-    start = _Flight(dr.full(mi.Float64, dr.inf, width), dr.zeros(mi.UInt32, width), u, rng, start_passages(media, width))
+    nowhere, zero, no_lane = dr.full(mi.Float64, dr.inf, width), dr.zeros(mi.UInt32, width), dr.full(mi.Bool, False, width)
+    has_grids = any(_has_densities(part) for body in bodies for part in body.view.parts)
+    densities = [dr.full(mi.Float, 1, width) for _ in range(media.channels if has_grids else 0)]
+    start = _Flight(nowhere, zero, u, rng, start_passages(media, width), densities, no_lane)
     if known is not None:
         start.t, start.body = dr.select(known.on, known.t, start.t), dr.select(known.on, known.body, start.body)
     traced = active
@@ -459,9 +558,9 @@ def _find_first_collision(
     return replace(end, t=dr.select(active & ~traced, ray.maxt, end.t)), flight
 
 
-def _uses_delta_tracking(part: Extinction) -> bool:
-    """Whether delta tracking draws the flights through a part."""
-    return not part.exact_line or (part.lattice is not None and part.lattice.block_ranges is not None and part.channels == 1)
+def _tracks_grid(part: Extinction) -> bool:
+    """Whether the part is a grid through which delta tracking draws flights."""
+    return part.exact_line and part.lattice is not None and part.lattice.block_ranges is not None
 
 
 def _channel_probabilities(beta: mi.Spectrum) -> list[mi.Float]:

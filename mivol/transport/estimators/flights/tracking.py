@@ -29,7 +29,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import maximum
-from mivol.transport.media.extinction import BoundedExtinction, RayInterval
+from mivol.transport.media.extinction import BoundedExtinction, RayInterval, to_scene_channels
 from mivol.transport.media.grid_extinction import GridExtinction, clip_interval
 from mivol.transport.traversal.grid_walk import Cell, walk_cells
 from mivol.transport.traversal.lattice import Lattice, Segment
@@ -50,7 +50,9 @@ ROULETTE_BELOW = 0.1
 """Estimate below which Russian roulette may end a ray [1], to save look-ups for negligible light."""
 
 LOOKUP_RATE = 4.0
-"""kappa: look-ups for each unit of residual optical depth int (M - m) dt."""
+"""kappa: look-ups for each unit of residual optical depth int (M - m) dt, and tentative collisions for each unit of the optical
+depth of the majorant of an rgb grid. (Gradients in a thin and a dense rgb smoke, over exact densities: variance 1.76 and 1.13,
+time 0.48 and 0.64 with 1; 1.29 and 1.01, 0.48 and 0.70 with 2; 1.35 and 1.02, 0.50 and 0.81 with 4.)"""
 
 
 @dataclass
@@ -234,8 +236,8 @@ def ratio_tracking(
 
 def ratio_tracking_in_grid(
     lattice: Lattice, segment: Segment, scale: mi.Float, rate: mi.Float, rng: mi.UInt32, active: mi.Bool
-) -> tuple[mi.Float, mi.UInt32]:
-    """Estimate the transmittance of a segment through a grey grid by look-ups at one rate, without a walk.
+) -> tuple[list[mi.Float], mi.UInt32]:
+    """Estimate the transmittance of a segment through a grid for each channel by look-ups at one rate, without a walk.
 
     Args:
         lattice: the grid.
@@ -246,26 +248,28 @@ def ratio_tracking_in_grid(
         active: lanes to track; other lanes return 1.
 
     Returns:
-        The estimate, in [0, 1], and the next state of the generator.
+        The estimates, in [0, 1], and the next state of the generator.
 
     Bias: none. Variance: T^2 (exp(int E(c^2) / rate dt) - 1) with the drawn corner c, at most T^2 (exp(tau k) - 1) if the
-    largest extinction is k times the rate. Cost: ``rate`` times the length look-ups of one value each.
+    largest extinction is k times the rate. Cost: ``rate`` times the length look-ups of one node each.
     """
-    values, length, pace = dr.detach(lattice.values.array), segment.length, dr.rcp(rate)
+    values, length, pace, channels = dr.detach(lattice.values.array), segment.length, dr.rcp(rate), lattice.channels
     find_node = _make_node_finder(lattice)
     entry, d = mi.Vector3f(segment.cell) + segment.frac, segment.d
 
-    def step(s: mi.Float, T: mi.Float, rng: mi.UInt32, on: mi.Bool) -> tuple:
+    def step(s: mi.Float, T: list[mi.Float], rng: mi.UInt32, on: mi.Bool) -> tuple:
         rng, u = draw_pcg32(rng, 4)
         s = dr.fma(-dr.log(u[3]), pace, s)
         on &= s < length
         # Each corner of the cell has its trilinear weight as probability.
         corner = mi.Vector3i(dr.floor(dr.fma(d, s, entry) + mi.Vector3f(*u[:3])))
-        value = dr.gather(mi.Float, values, *find_node(corner, on))
-        return s, dr.select(on, T * dr.fma(-scale * pace, value, 1), T), rng, on
+        node, stored = find_node(corner, on)
+        row = [dr.gather(mi.Float, values, node * channels + c, stored) for c in range(channels)]
+        return s, [dr.select(on, t * dr.fma(-scale * pace, v, 1), t) for t, v in zip(T, row, strict=True)], rng, on
 
     width = dr.width(length)
-    start = (dr.zeros(mi.Float, width), dr.full(mi.Float, 1, width), mi.UInt32(rng), active & (length > 0))
+    ones = [dr.full(mi.Float, 1, width) for _ in range(channels)]
+    start = (dr.zeros(mi.Float, width), ones, mi.UInt32(rng), active & (length > 0))
     _, T, rng, _ = dr.while_loop(start, lambda s, T, rng, on: on, step, label="points of a grid")
     return T, rng
 
@@ -274,47 +278,59 @@ def delta_tracking_in_blocks(
     part: GridExtinction,
     scale: mi.Float,
     interval: RayInterval,
+    channel: mi.UInt32,
     u: mi.Float,
     rng: mi.UInt32,
-) -> tuple[mi.Float64, mi.UInt32]:
-    """Find the first collision with a grey grid with block ranges.
+) -> tuple[mi.Float64, list[mi.Float], mi.UInt32]:
+    """Find the first collision with a grid with block ranges.
 
     Args:
         part: the grid.
         scale: factor on its values.
         interval: interval of the ray.
+        channel: channel of an rgb grid in which collisions are drawn.
         u: uniform random number in [0, 1) of the first tentative collision.
         rng: state of the random number generator of all others.
 
     Returns:
-        Distance of the collision on the ray [length], infinite without a collision, and the next state of the generator.
+        Distance of the collision on the ray [length], infinite without a collision; the density of all tentative collisions and
+        of what they were found to be, for each channel of an rgb grid, relative to the largest [1] (empty for a grey grid); and
+        the next state of the generator.
 
-    Bias: none. Cost: one step a block, and one look-up for each tentative collision: at most int M dt look-ups.
+    Bias: none. Cost: one step a block, and one look-up for each tentative collision: at most int M dt look-ups, and kappa times
+    as many in rgb grids.
     """
-    lattice = part.lattice
+    lattice, channels = part.lattice, part.channels
+    # More tentative collisions tell the transmittances of the channels with less noise.
+    rate_of_colours = LOOKUP_RATE if channels > 1 else 1
     segment = clip_interval(lattice, interval)
     blocks, values = lattice.block_ranges, dr.detach(part.values)
     draw_corner = _make_corner_sampler(lattice, segment)
 
     def visit(state: tuple, cell: Cell, on: mi.Bool) -> tuple[tuple, mi.Float]:
-        ahead, s, collides, rng = state
-        (least,), above = blocks.read(cell.lower + 1, on)
-        majorant = least + above
+        ahead, s, collides, densities, rng = state
+        least, above = blocks.read(cell.lower + 1, on)
+        majorant = rate_of_colours * (maximum(least) + above)
         rate = scale * majorant
         # -- To the end of the block, or to the next tentative collision --------------------------------------------------
         meets = on & (ahead < rate * cell.dt)
         dt = dr.select(meets, dr.minimum(ahead / rate, cell.dt), cell.dt)
         # -- Real or not, from one corner of the cell ------------------------------------------------------------------
         rng, u = draw_pcg32(rng, 5)
-        value = dr.gather(mi.Float, values, *draw_corner(cell, dt, u, meets))
-        real = meets & (u[3] * majorant <= value)
+        node, stored = draw_corner(cell, dt, u, meets)
+        row = [dr.gather(mi.Float, values, node * channels + c, stored) for c in range(channels)]
+        real = meets & (u[3] * majorant <= select_channel(row, channel))
+        if channels > 1:
+            found = [dr.select(real, value, majorant - value) for value in row]
+            densities = scale_to_largest([dr.select(meets, d * f, d) for d, f in zip(densities, found, strict=True)])
         ahead = dr.select(meets, -dr.log(u[4]), dr.maximum(ahead - dr.select(on, rate * dt, 0), 0))
-        return (ahead, dr.select(real, cell.s + dt, s), collides | real, rng), dt
+        return (ahead, dr.select(real, cell.s + dt, s), collides | real, densities, rng), dt
 
     width = dr.width(interval.ray)
-    start = (-dr.log(1 - u), dr.zeros(mi.Float, width), dr.full(mi.Bool, False, width), rng)
+    ones = [dr.full(mi.Float, 1, width) for _ in range(channels if channels > 1 else 0)]
+    start = (-dr.log(1 - u), dr.zeros(mi.Float, width), dr.full(mi.Bool, False, width), ones, rng)
     coarse = BlockLattice(tuple(n - 1 for n in blocks.res))
-    _, s, collides, rng = walk_cells(
+    _, s, collides, densities, rng = walk_cells(
         coarse,
         block_segment(segment, blocks.shift),
         visit,
@@ -324,7 +340,22 @@ def delta_tracking_in_blocks(
         until=lambda state: state[2],
         halts=True,
     )
-    return dr.select(collides, segment.start + mi.Float64(s), dr.inf), rng
+    return dr.select(collides, segment.start + mi.Float64(s), dr.inf), densities, rng
+
+
+def scale_to_largest(rows: list[mi.Float]) -> list[mi.Float]:
+    """Divide numbers by the largest of them, so that products of many stay within the range of float32."""
+    inverse = dr.rcp(dr.maximum(maximum(rows), 1e-30))
+    return [row * inverse for row in rows]
+
+
+def select_channel(rows: list[mi.Float], channel: mi.UInt32) -> mi.Float:
+    """Select the value of a channel; a grey part has one channel, and a mono variant uses the luminance of three."""
+    rows = to_scene_channels(rows, 1) if mi.is_monochromatic else rows
+    value = rows[0]
+    for k, row in enumerate(rows[1:], 1):
+        value = dr.select(channel == k, row, value)
+    return value
 
 
 def delta_tracking(

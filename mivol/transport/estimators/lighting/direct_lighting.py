@@ -241,7 +241,7 @@ class DirectLighting:
         attached: bool,
         active: mi.Bool,
         rng: mi.UInt32 | None = None,
-        known: tuple[mi.Float, mi.Bool] | None = None,
+        known: tuple[mi.Float | mi.Spectrum, mi.Bool] | None = None,
         looks_up: mi.Bool | None = None,
     ) -> DirectSample:
         """Estimate the direct light at a vertex of a path by one emitter sample; the path's next segment is the second sample.
@@ -266,7 +266,8 @@ class DirectLighting:
         start, medium = vertex.leave(direct.p)
         shadow, traced, is_followed, is_known = None, on, mi.Bool(on), mi.Bool(False)
         if known is not None:
-            is_known = known[1] & (known[0] >= 0)
+            stored = mi.Spectrum(known[0])
+            is_known = known[1] & (stored[0] >= 0)
             traced = on & ~is_known
         if self.shadow_table is not None:
             inside = on & vertex.in_medium
@@ -274,7 +275,7 @@ class DirectLighting:
             shadow, traced = TabulatedShadow.look_up(self.shadow_table, start, medium, direct, number, inside), on & ~inside
         ray_segment, clear, tau, light = trace_shadow_ray(self.media, start, medium, direct, traced, rng, looks_up)
         if known is not None:
-            tau, light, clear = None, dr.select(is_known, known[0], light), dr.select(is_known, known[0] > 0, clear)
+            tau, light, clear = None, dr.select(is_known, stored, light), dr.select(is_known, dr.any(stored > 0), clear)
         on &= clear
         w_mis = mi.Float(1)
         if sample.has_alternative is not False:

@@ -100,7 +100,7 @@ def find_transmittance(
     thicker = [t - dr.maximum(clearest - ROULETTE_TAU, 0) for t in tau]
     light = dr.select(clearest <= enough, transmittance(thicker), 0)
     if looked_up is not None:
-        light, tau = light * looked_up, None
+        light, tau = light * to_spectrum(looked_up), None
     return end, tau, passages, light * end.null_transmission
 
 
@@ -123,7 +123,7 @@ def segment_transmittance(
             return transmittance(segment_optical_depth(media, segment, active))
         sparse = _SparseTransmittance(media, looks_up)
         tau, T, _ = revisit_media(media, segment, sparse.visit, sparse.start(dr.width(segment.ray), rng), active, anywhere=True)
-        return transmittance(tau) * T
+        return transmittance(tau) * to_spectrum(T)
     start = ([mi.Float(1) for _ in range(media.channels)], rng)
     return to_spectrum(revisit_media(media, segment, _multiply_transmittance, start, active, anywhere=True)[0])
 
@@ -165,8 +165,9 @@ class _SparseTransmittance:
     enough: float | mi.Float | None = None
 
     def start(self, width: int, rng: mi.UInt32) -> tuple:
-        """The state of a walk: optical depth of walked media for each channel [1], transmittance of others, generator."""
-        return [dr.zeros(mi.Float, width) for _ in range(self.media.channels)], dr.full(mi.Float, 1, width), mi.UInt32(rng)
+        """The state of a walk: optical depth of walked media and transmittance of others for each channel [1], generator."""
+        depth, T = ([dr.full(mi.Float, value, width) for _ in range(self.media.channels)] for value in (0, 1))
+        return depth, T, mi.UInt32(rng)
 
     def visit(self, state: tuple, interval: MediumInterval) -> tuple:
         tau, T, rng = state
@@ -182,7 +183,7 @@ class _SparseTransmittance:
             is_thin = self.looks_up & (STEPS_PER_LOOKUP * rate < 1.5 * dr.norm(segment.d))
             lanes = interval.active & is_thin & (rate > 0)
             own, rng = ratio_tracking_in_grid(part.lattice, segment, scale, dr.select(lanes, rate, 1), rng, lanes)
-            T = T * own
+            T = [a * b for a, b in zip(T, to_scene_channels(own, channels), strict=True)]
             walked = replace(interval, active=interval.active & ~is_thin)
             rows = body.optical_depth(walked, channels, [part], self.enough)
             tau = [t + d for t, d in zip(tau, rows, strict=True)]

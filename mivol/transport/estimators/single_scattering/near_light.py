@@ -48,7 +48,7 @@ from mivol.transport.estimators.single_scattering.single_scattering import (
     event_coefficients,
     event_interaction,
 )
-from mivol.transport.media.extinction import to_components
+from mivol.transport.media.extinction import to_components, to_spectrum
 from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.traversal.random_numbers import SpreadSampler, draw_pcg32, draw_state, fork_state
@@ -162,18 +162,20 @@ class NearLightPlace:
         sigma_t: extinction [1/length].
         reach: transmittance up to the point, over the density of this distance [length]; 0 without light.
         shadow: transmittance of the shadow ray, as in :class:`.DirectSample` [1].
+
+    The last three are numbers in grey scenes, and spectra beside an rgb extinction.
     """
 
     t: mi.Float64
     body: mi.UInt32
-    sigma_t: mi.Float
-    reach: mi.Float
-    shadow: mi.Float
+    sigma_t: mi.Float | mi.Spectrum
+    reach: mi.Float | mi.Spectrum
+    shadow: mi.Float | mi.Spectrum
 
     @classmethod
-    def empty(cls, count: int) -> NearLightPlace:
+    def empty(cls, count: int, channels: int) -> NearLightPlace:
         """Room in memory for many places."""
-        kinds = mi.Float64, mi.UInt32, mi.Float, mi.Float, mi.Float
+        kinds = mi.Float64, mi.UInt32, *[mi.Float if channels == 1 else mi.Spectrum] * 3
         return cls(*(dr.empty(kind, count) for kind in kinds))
 
     def at(self, index: mi.UInt32, active: mi.Bool) -> NearLightPlace:
@@ -238,9 +240,9 @@ class NearLighting:
 
     @property
     def has_places(self) -> bool:
-        """Whether a :class:`NearLightPlace` holds all results of a walk: grids of one channel, and no tinted shadows."""
+        """Whether a :class:`NearLightPlace` holds all results of a walk: in grids, without tinted shadows."""
         media = self.media
-        return media.channels == 1 and not (media.is_bounded or media.is_homogeneous or media.has_null_transmission)
+        return not (media.is_bounded or media.is_homogeneous or media.has_null_transmission)
 
     def draw(self, sampler: mi.Sampler | SpreadSampler, active: mi.Bool) -> NearLightSamples:
         """Draw the random numbers of a segment."""
@@ -323,8 +325,9 @@ class NearLighting:
         if known is not None:
             place, is_known = known
             event.t, event.body = dr.select(is_known, place.t, event.t), dr.select(is_known, place.body, event.body)
-            event.sigma_t = [dr.select(is_known, place.sigma_t, event.sigma_t[0])]
-            event.on = dr.select(is_known, everywhere & (place.reach > 0), event.on)
+            stored = [place.sigma_t] if media.channels == 1 else to_components(place.sigma_t)
+            event.sigma_t = [dr.select(is_known, s, found) for s, found in zip(stored, event.sigma_t, strict=True)]
+            event.on = dr.select(is_known, everywhere & dr.any(mi.Spectrum(place.reach) > 0), event.on)
             reach = dr.select(is_known, place.reach, reach)
         gain = dr.select(event.on, segment.beta * reach, 0)
         # -- Direct light ------------------------------------------------------------------------------------------------
@@ -336,8 +339,8 @@ class NearLighting:
         sigma_t, sigma_s = event_coefficients(media, ray, event, mei, proposal.is_exact)
         light = ScatteredLight(media, segment, Scattering(event, mei, gain, [direct], sigma_t, sigma_s, chance))
         shadow = DirectLight(media, direct.ray_segment, light.value, direct.on)
-        one = to_components(reach)[0], to_components(direct.T)[0]
-        place = NearLightPlace(event.t, event.body, event.sigma_t[0], *one)
+        found = [to_spectrum(event.sigma_t), mi.Spectrum(reach), mi.Spectrum(direct.T)]
+        place = NearLightPlace(event.t, event.body, *(found if media.channels > 1 else [row[0] for row in found]))
         if direct.shadow is None:
             return NearLight(light, shadow, chance, place)
         return NearLight(light, shadow, chance, place, direct.shadow.times(sigma_s * gain))
