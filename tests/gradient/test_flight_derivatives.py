@@ -145,6 +145,18 @@ def test_forward_is_the_transpose_of_reverse(place, whole_paths):
     assert_each_transposed(build(), [keys[name] for name in FOLLOWED[place]], mi.load_dict(mivol(**settings)), 16, fresh(5))
 
 
+@pytest.mark.statistical
+def test_tangents_in_uneven_light_have_the_mean_of_replays() -> None:
+    """A lamp beside thin smoke: flights and their probes must have one baseline, though the light differs along flights."""
+    density = rough_grid(1, 1.5, (18, 17, 16))
+    parts = {"smoke": smoke(density, 0.9, "own")[0], "lamp": point([1.4, 0.1, 0.0], 5.0)[0]}
+    scene = close_up(parts, res=8, fov=70.0, origin=(-0.9, 0.1, 0.1), target=(0.0, 0.1, 0.0))
+    key, integrator = "smoke.interior_medium.sigma_t.data", mi.load_dict(mivol(max_depth=3, near_light="vertices"))
+    tangents = [forward(scene, key, density, 256, fresh(100 + k), integrator).mean() for k in range(BATCHES)]
+    there = Moments.from_values(np.array(tangents)[:, None])
+    assert_same_mean(along(scene, key, density, integrator, 256), there, what="the derivative by the density")
+
+
 def _difference(scene: mi.Scene, key: str, v: np.ndarray, h: float, integrator: mi.Integrator, spp: int) -> Estimate:
     """(f(x + h v) - f(x - h v)) / 2 h of the mean image; batches share random numbers, which cancels most of the noise."""
     params = mi.traverse(scene)

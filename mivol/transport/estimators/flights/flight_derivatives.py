@@ -147,7 +147,8 @@ class FlightSegment:
     def jvp_light(self) -> mi.Spectrum:
         total = mi.Spectrum(0)
         if self.baseline is not None:
-            total -= self._scattered * self._flight_baseline * self._jvp_extinction
+            b = _baseline_of_tangents(self.media, self.baseline, self.segment.ray, self.active)
+            total -= self._scattered * b * self._jvp_extinction
         if self.gaussian_light is not None:
             total += self.gaussian_light.jvp()
         if self.emission is None:
@@ -171,16 +172,6 @@ class FlightSegment:
         front = RaySegment.upto(self.segment.ray, self.segment.medium, self.emission.point.t)
         front.u = self.passed.u
         return front
-
-    @property
-    def _flight_baseline(self) -> mi.Spectrum:
-        """The baseline of the only medium with a tangent, if it is constant along the flight; else its mean.
-
-        A baseline that varies along the flight would need a second walk.
-        """
-        followed = [body for body in self.media.bodies if any(body.has_tangent)]
-        b = self.baseline.along(followed[0], self.segment.ray, self.active) if len(followed) == 1 else None
-        return self.baseline.average if b is None or callable(b) else b
 
     # -- Throughput ------------------------------------------------------------------------------------------------------
 
@@ -375,20 +366,21 @@ class ProbeTerm:
     def _gain(self) -> mi.Spectrum:
         return dr.select(self.on, self.probe.gain * (self.probe.total / dr.select(self.on, self.probe.weight, 1)), 0)
 
-    def _weight(self, body: Body, on: mi.Bool) -> tuple[str, mi.Spectrum]:
+    def _weight(self, body: Body, on: mi.Bool, baseline: mi.Spectrum | None) -> tuple[str, mi.Spectrum]:
         """The name of the probe's coefficient, and the derivative of the light by this coefficient."""
         name, weight = _collision_weight(self.media, body, self.probe.ray, self.probe.t, on)
         bracket = self.source
         if body.view.albedo is not None:
             bracket = bracket * dr.detach(eval_albedo(body, self.mei, on))
-        if self.baseline is not None:
-            bracket = bracket - self.baseline.at_point(body, self.probe.ray, self.probe.t, on)
+        if baseline is not None:
+            bracket = bracket - baseline
         return name, self._gain * bracket * _probe_extinction(self.media, body) * weight
 
     def vjp(self, dL: mi.Spectrum) -> None:
         media, probe = self.media, self.probe
         for body, on in media.bodies_at(probe.body, self.on):
-            name, weight = self._weight(body, on)
+            b = None if self.baseline is None else self.baseline.at_point(body, probe.ray, probe.t, on)
+            name, weight = self._weight(body, on, b)
             body.vjp_extinction_at(
                 probe.ray, probe.t, colours_to_channels(dr.select(on, dL * weight, 0), media.channels), on, name
             )
@@ -401,8 +393,9 @@ class ProbeTerm:
 
     def jvp(self) -> mi.Spectrum:
         media, probe, total = self.media, self.probe, mi.Spectrum(0)
+        b = None if self.baseline is None else _baseline_of_tangents(media, self.baseline, probe.ray, self.on)
         for body, on in media.bodies_at(probe.body, self.on):
-            name, weight = self._weight(body, on)
+            name, weight = self._weight(body, on, b)
             tangent = weight * to_spectrum(body.jvp_extinction_at(probe.ray, probe.t, media.channels, on, name))
             if body.view.albedo is not None:
                 with dr.resume_grad():
@@ -501,6 +494,17 @@ class ShadowTerm:
 
 
 # -- Weights and slopes at points --------------------------------------------------------------------------------------
+
+
+def _baseline_of_tangents(media: SceneMedia, baseline: Baseline, ray: Ray, active: mi.Bool) -> mi.Spectrum:
+    """The baseline of the only medium with a tangent, if it is constant along a flight; else its mean.
+
+    A baseline that varies along the flight would need a second walk. Flights and probes must have the same one, or their terms
+    would not have the mean 0.
+    """
+    followed = [body for body in media.bodies if any(body.has_tangent)]
+    b = baseline.along(followed[0], ray, active) if len(followed) == 1 else None
+    return baseline.average if b is None or callable(b) else b
 
 
 def collision_weights(media: SceneMedia, ray: Ray, hit: Collision) -> mi.Spectrum:

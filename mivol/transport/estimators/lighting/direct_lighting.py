@@ -258,7 +258,8 @@ class DirectLighting:
         Bias: none. Variance: one emitter sample. Cost: one shadow ray.
         """
         direct, it = sample.direct, vertex.interaction
-        on = active & (direct.pdf > 0)
+        # At the place of a lamp to all digits, its light would be infinite.
+        on = active & (direct.pdf > 0) & (direct.dist > 0)
         scattered, pdf = vertex.eval_and_pdf(direct.d, on)
         if not attached:
             # A dark sample needs no shadow ray. It may have derivatives, of a BSDF that is 0.
