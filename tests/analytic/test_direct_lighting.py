@@ -19,6 +19,7 @@ from mivol.transport.estimators.lighting.emitters import EventSamples
 from mivol.transport.estimators.lighting.shadow_rays import trace_shadow_ray
 from mivol.transport.estimators.lighting.vertex import MediumVertex, SurfaceVertex
 from mivol.transport.media.body import medium_interaction
+from mivol.transport.traversal.rays import point_along
 from scenes import box_of, camera, centred, media_of, medium, sky
 
 ROUNDING = 16 * 2.0**-23
@@ -61,6 +62,20 @@ def test_a_wall_under_a_emitter():
     # Rays start a little above the wall: 1e-5 of a scene of 20, and the emitter is that much nearer.
     assert np.array(found.value).ravel() == pytest.approx([0.5 / np.pi * POWER / FAR**2 * np.exp(-DEPTH)] * 3, rel=1e-3)
     assert found.on[0] and not off.on[0] and not np.array(off.value).any()
+
+
+def test_a_point_of_a_medium_at_the_place_of_a_lamp_has_finite_light() -> None:
+    """1 / r^2 is infinite there; a path passes a lamp as close as its digits tell with a chance of some 1e-8."""
+    media = media_of(scene(emitter=emitter(1.5)))
+    ray = mi.Ray3f(mi.Point3f(0, 0, 3), mi.Vector3f(0, 0, -1))
+    mei = medium_interaction(ray, mi.Float64(1.5))
+    mei.medium = media.medium_of(mi.UInt32(0), mi.Bool(True))
+    direct, vertex = DirectLighting(media), MediumVertex(media, mei, point_along(ray, mi.Float64(1.5)))
+    with dr.suspend_grad():
+        aim = direct.sample_emitter(vertex.interaction, mi.Point2f(0.5), mi.Bool(True))
+        found = direct.estimate_at_vertex(vertex, aim, False, mi.Bool(True))
+    assert float(aim.direct.dist[0]) == 0
+    assert not np.array(found.value).any() and not found.on[0]
 
 
 @pytest.mark.parametrize("attached", [False, True])
