@@ -45,6 +45,7 @@ from mivol.scene.choices import (
     count_occupied_cells,
     is_dense,
     is_scattering_visible,
+    tracks_flights,
 )
 from mivol.scene.media_light import find_emitting_boxes
 from mivol.scene.needs import MediumFacts, Needs
@@ -112,6 +113,7 @@ class Plan:
         skips_empty: whether empty blocks of each medium are skipped.
         trims: whether only those before the first and behind the last occupied block of a ray are skipped.
         estimates_shadows: whether shadows of each medium are estimated in images.
+        tracks_flights: whether delta tracking draws flights through the grids of each medium.
         segment: name of the segment estimator in :data:`mivol.transport.path.estimators.SEGMENT_ESTIMATORS`.
         scattering_points: scattering points per camera ray in images.
         pass_rays: most rays of a pass.
@@ -139,6 +141,7 @@ class Plan:
     skips_empty: tuple[bool, ...]
     trims: tuple[bool, ...]
     estimates_shadows: tuple[bool, ...]
+    tracks_flights: tuple[bool, ...]
     segment: str
     scattering_points: int
     pass_rays: int
@@ -178,7 +181,7 @@ class Plan:
     def readings(self, for_images: bool) -> tuple:
         """All that decides what is read of the values of media (:func:`read_parts`)."""
         near = self.draws_near_light if for_images else self.near_light_in_derivatives
-        return self.skips_empty, self.trims, self.estimates_shadows, self.segment == "free_flight", near
+        return self.skips_empty, self.trims, self.estimates_shadows, self.tracks_flights, near
 
 
 def find_skipping(occupied: float, is_sparse: bool) -> tuple[bool, bool]:
@@ -208,7 +211,8 @@ def plan_key(medium: MediumFacts) -> tuple:
         medium.occupied >= MIN_FILLED_SHARE,
         _round_share(medium.occupied),
     )
-    numbers = {"occupied": shares, "tau_max": is_dense(medium), "tau_min": _is_thick(medium), "albedo_min": _is_dark(medium)}
+    depth = is_dense(medium), tracks_flights(medium)
+    numbers = {"occupied": shares, "tau_max": depth, "tau_min": _is_thick(medium), "albedo_min": _is_dark(medium)}
     return tuple((vars(medium) | numbers).values())
 
 
@@ -291,6 +295,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         skips,
         trims,
         tracks,
+        tuple(segment == "free_flight" and tracks_flights(m) for m in needs.media),
         segment,
         events,
         pass_rays,
@@ -395,11 +400,11 @@ Readings = list[list[PartReading]]
 
 def read_parts(needs: Needs, plan: Plan, survey: SceneSurvey, for_images: bool) -> Readings:
     """Read the values that the planned estimators need besides the values themselves."""
-    skips_empty, trims, estimates_shadows, flies, near = plan.readings(for_images)
-    media = zip(needs.boundaries, needs.views, skips_empty, trims, estimates_shadows, strict=True)
+    skips_empty, trims, estimates_shadows, tracks_flights, near = plan.readings(for_images)
+    media = zip(needs.boundaries, needs.views, skips_empty, trims, estimates_shadows, tracks_flights, strict=True)
     return [
-        [read_part(p, survey, boundary.name, skip, trim, tracks or flies, near) for p in view.parts]
-        for boundary, view, skip, trim, tracks in media
+        [read_part(p, survey, boundary.name, skip, trim, estimates or tracks, near) for p in view.parts]
+        for boundary, view, skip, trim, estimates, tracks in media
     ]
 
 

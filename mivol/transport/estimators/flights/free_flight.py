@@ -313,7 +313,8 @@ class FreeFlight:
         Bias: as of :func:`regular_tracking`. Cost: one walk up to the collision.
         """
         media = self.media
-        if not any(_tracks_grid(part) for body in self.bodies for part in body.view.parts):
+        parts = [part for body in self.bodies for part in body.view.parts]
+        if not any(_tracks_grid(part) or _has_densities(part) for part in parts):
             return None
         u, rng = self.draw(sampler, active)
         if media.channels == 1:
