@@ -45,7 +45,9 @@ class PluginField:
     may_jump: ClassVar[bool] = True  # as a gridvolume of the nearest voxels does
 
     def __init__(self, volume: mi.Volume) -> None:
-        self.volume, self.kind = volume, type(volume).__name__
+        kind = type(volume).__name__
+        # Mitsuba names every plugin in C++ after its base, and every class in Python too.
+        self.volume, self.kind = volume, volume.class_name() if kind == "Volume" else kind
         box = mi.Volume.bbox(volume)  # what Mitsuba reads too: it ignores a bbox() of Python
         low, high = np.array(box.min, np.float64).ravel(), np.array(box.max, np.float64).ravel()
         if not (np.isfinite(high - low).all() and (high > low).all()):

@@ -292,6 +292,9 @@ def choose_flights(medium: MediumFacts, segment: str) -> Choice | None:
     if segment != "free_flight":
         return None
     subject = f"flights in {medium.name}"
+    if medium.bounded == "GridVolume":
+        why = "its grid is not trilinear in its box: another filter_type or wrap_mode than trilinear and clamp, or a to_world"
+        return Choice(subject, "delta tracking", f"{why} with a wrong inverse (rotate about an axis that is not normalised)")
     if medium.bounded:
         return Choice(subject, "delta tracking", "only a majorant is known")
     if medium.gaussians:

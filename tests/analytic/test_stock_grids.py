@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import scenes
+from mivol.experiments.script import explain
 from mivol.transport.media import stock_grids
 from mivol.transport.media.medium_view import view_medium
 from mivol.transport.media.stock_grids import StockGrids, find_grid_place
@@ -84,6 +85,18 @@ def is_walked(medium: mi.Medium, grids: StockGrids | None = None, place: np.ndar
 def test_grids_with_another_filter_or_border_are_read_at_points(voxels: np.ndarray, more: dict) -> None:
     """Where all borders are 0 they are the same in any case."""
     assert is_walked(stock(voxels, **more)) == (voxels is LONE and "wrap_mode" in more)
+
+
+def test_a_transform_with_a_wrong_inverse_is_named() -> None:
+    """Mitsuba's ``rotate`` about an axis that is not normalised; about the same axis of length 1 the grid is walked."""
+    for axis, is_named in (([1, 1, 0], True), ([0.5**0.5, 0.5**0.5, 0], False)):
+        turn = mi.ScalarTransform4f().rotate(axis, 30)
+        grid = {"type": "gridvolume", "grid": mi.VolumeGrid(VOXELS[1].astype(np.float32)), "to_world": turn}
+        box = {"type": "cube", "to_world": turn.translate(0.5).scale(0.5), "bsdf": {"type": "null"}}
+        interior = {"type": "heterogeneous", "sigma_t": grid, "albedo": 0.5}
+        sensor = scenes.camera([3, 3, 3], [0, 0, 0])
+        text = explain({"type": "scene", "box": {**box, "interior": interior}, "sky": scenes.sky(), "sensor": sensor})
+        assert ("wrong inverse" in str(text)) is is_named
 
 
 def test_trilinear_grids_are_walked() -> None:

@@ -199,6 +199,7 @@ def test_lighting_of_free_flights():
     ("medium", "choice"),
     [
         (fog(bounded="Ball"), "delta tracking"),
+        (fog(bounded="GridVolume"), "delta tracking"),
         (fog(resolutions=()), "exact"),
         (fog(extinction="rgb"), "delta tracking, with one sampled channel per flight"),
         (fog(extinction="rgb", resolutions=((2, 3, 4),), tau_max=4.5), "delta tracking, with one sampled channel per flight"),
