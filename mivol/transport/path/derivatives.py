@@ -18,8 +18,9 @@ the walk keeps its collisions (:mod:`.kept_collisions`).
 Only the device knows the number of branches, so that derivatives can be recorded and replayed. Branches have as many lanes as
 stems, of which the last are off.
 
-Bias: none. Memory: about 80 numbers a stem, 120 with probes (160 with surfaces); up to 40 numbers more for segments in passes
-of many rays (100 beside near light). Derivatives by albedos alone: up to ``MAX_KEPT_COLLISIONS`` in all.
+Bias: none. Memory: about 80 numbers a stem, 120 with probes (160 with surfaces); in passes of many rays up to 40 numbers more
+for segments (100 beside near light; 90 and 210 with an rgb extinction). Derivatives by albedos alone: up to
+``MAX_KEPT_COLLISIONS`` in all.
 
 References: Arvo & Kirk 1990 (splitting); Vicini et al. 2021 (path replay).
 """

@@ -12,10 +12,10 @@ throughputs, so they stay bounded on paths of any length.
 .. math:: w_k = \frac{F_k}{\sum_c p_c F_c}, \qquad F_k = \sigma_k T_k \quad\text{or}\quad
           F_k = \frac{\sigma_k(x)}{M} \prod_j \Big(1 - \frac{\sigma_k(x_j)}{M_j}\Big)
 
-The first F is exact, and needs a second walk of a grid. Delta tracking at one rate M for all channels has the second: the
-density of all tentative collisions. Its mean over the points x_j is the first, so terms and derivatives that depend on the
-collision alone have the same means with either. A flight may have gone on behind the collision with another medium; its density
-then has the same mean as well.
+The first F is exact: a walk that inverts the optical depth of one channel sums those of all. Delta tracking at one rate M for
+all channels has the second F, the density of all tentative collisions. Its mean over the points x_j is the first, so terms and
+derivatives that depend on the collision alone have the same means with either. A flight may have gone on behind the collision
+with another medium; its density then has the same mean as well.
 
 One point of each flight, drawn uniformly over its length t, samples the emission j: the mean of t j over all flights is
 :math:`\int T j\,dt`, also in regions without extinction. The light of Gaussians is summed (:mod:`.gaussian_light`).
@@ -104,9 +104,6 @@ from mivol.transport.traversal.interpolation import (
 from mivol.transport.traversal.lattice import points_of_piece
 from mivol.transport.traversal.random_numbers import SpreadSampler, draw_lead, draw_pcg32, draw_state
 from mivol.transport.traversal.rays import Ray, point_along
-
-ALMOST_ONE = 1 - 2.0**-24
-"""Largest number below 1 in float32."""
 
 __all__ = ["FreeFlight", "make_collision", "regular_tracking", "sample_gaussian_flight"]
 
@@ -323,7 +320,7 @@ class FreeFlight:
         # The number that is spread over the samples of a pixel spreads their channels too.
         scaled = u * media.channels
         channel = dr.minimum(mi.UInt32(scaled), media.channels - 1)
-        u = dr.minimum(scaled - channel, ALMOST_ONE)
+        u = dr.minimum(scaled - channel, dr.one_minus_epsilon(mi.Float))
         end, flight = _find_first_collision(media, ray, medium, u, channel, rng, active, inverts=True)
         collides = active & (flight.t < mi.Float64(end.t))
         passed = RaySegment.upto(ray, medium, dr.select(collides, flight.t, mi.Float64(end.t)), flight.passages)
