@@ -241,12 +241,13 @@ def read_part(
         return reading
     reading.floored = part.floored
     # A grey variant averages an rgb extinction over the channels; the transmittance of the mean is not the mean transmittance.
-    if tracks and not (mi.is_monochromatic and part.channels > 1):
+    has_estimates = not (mi.is_monochromatic and part.channels > 1)
+    if tracks and has_estimates:
         reading.block_ranges = read_block_ranges(part, survey, name)
     if draws_near_light:
         coarse = read_coarse_grid(survey, lattice, block_shift(lattice.res), False).lattice
         reading.rough, reading.rough_distances = coarse.values, coarse.empty_distances
-        if not (mi.is_monochromatic and part.channels > 1):
+        if has_estimates:
             reading.largest = read_largest(part, survey, name)
     return reading
 

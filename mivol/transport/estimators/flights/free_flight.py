@@ -70,7 +70,6 @@ from mivol.transport.media.extinction import (
     Extinction,
     RayInterval,
     to_components,
-    to_scene_channels,
     to_spectrum,
 )
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
@@ -314,19 +313,19 @@ class FreeFlight:
         if not any(_tracks_grid(part) or _has_densities(part) for part in parts):
             return None
         u, rng = self.draw(sampler, active)
-        if media.channels == 1:
-            _, flight = _find_first_collision(media, ray, medium, u, mi.UInt32(0), rng, active, inverts=True)
-            return KnownFlight(flight.t, flight.body, active)
-        # The number that is spread over the samples of a pixel spreads their channels too.
-        scaled = u * media.channels
-        channel = dr.minimum(mi.UInt32(scaled), media.channels - 1)
-        u = dr.minimum(scaled - channel, dr.one_minus_epsilon(mi.Float))
+        channel = mi.UInt32(0)
+        if media.channels > 1:
+            # The number that is spread over the samples of a pixel spreads their channels too.
+            scaled = u * media.channels
+            channel = dr.minimum(mi.UInt32(scaled), media.channels - 1)
+            u = dr.minimum(scaled - channel, dr.one_minus_epsilon(mi.Float))
         end, flight = _find_first_collision(media, ray, medium, u, channel, rng, active, inverts=True)
-        collides = active & (flight.t < mi.Float64(end.t))
-        passed = RaySegment.upto(ray, medium, dr.select(collides, flight.t, mi.Float64(end.t)), flight.passages)
-        collision = make_collision(media, ray, flight.t, flight.body, collides)
-        weight = _weigh_channels(media, mi.Spectrum(1), passed, collision, flight, active)
-        return KnownFlight(flight.t, flight.body, active, weight=weight)
+        found = KnownFlight(flight.t, flight.body, active)
+        if media.channels > 1:
+            collides = active & (flight.t < mi.Float64(end.t))
+            passed = RaySegment.upto(ray, medium, dr.select(collides, flight.t, mi.Float64(end.t)), flight.passages)
+            found.weight = _weigh_channels(media, mi.Spectrum(1), passed, active, flight, collides)
+        return found
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """Needs no preparation here: the path estimates the baseline (:mod:`mivol.transport.path.derivatives`)."""
@@ -353,14 +352,12 @@ class FreeFlight:
             # One point of the flight estimates the derivatives of bounded media.
             _, (passed.u,) = draw_pcg32(flight.rng, 1)
         collision = make_collision(media, ray, flight.t, flight.body, collides)
-        weight = mi.Spectrum(1)
-        if media.channels > 1:
-            known = segment.known
-            is_known = mi.Bool(False) if known is None or known.weight is None else active & known.on
-            weight = _weigh_channels(media, segment.beta, passed, collision, flight, active & ~is_known)
-            if known is not None and known.weight is not None:
-                # Paths that begin at a collision have its weight in their throughput already, and are not active.
-                weight = dr.select(is_known, known.weight, weight)
+        known = segment.known if segment.known is not None and segment.known.weight is not None else None
+        unknown = active if known is None else active & ~known.on
+        weight = _weigh_channels(media, segment.beta, passed, unknown, flight, collides)
+        if known is not None:
+            # Paths that begin at a collision have its weight in their throughput already, and are not active.
+            weight = dr.select(active & known.on, known.weight, weight)
         # -- The light of the media on the way --------------------------------------------------------------------------
         emission = None
         if self.emitting:
@@ -371,7 +368,7 @@ class FreeFlight:
         if self.has_gaussian_light:
 
             def weigh(front: RaySegment, on: mi.Bool) -> mi.Spectrum:
-                return _weigh_channels(media, segment.beta, front, None, None, on)
+                return _weigh_channels(media, segment.beta, front, on)
 
             gaussian_light = GaussianLight(media, segment, (end.t, t), weigh, active)
         # -- Term, factor, and the point for derivatives ----------------------------------------------------------------
@@ -406,9 +403,9 @@ def _weigh_channels(
     media: SceneMedia,
     beta: mi.Spectrum,
     passed: RaySegment,
-    collision: Collision | None,
-    flight: _Flight | None,
     active: mi.Bool,
+    flight: _Flight | None = None,
+    collides: mi.Bool | None = None,
 ) -> mi.Spectrum:
     """The weight of each channel: its density over the mean density of the channels, in proportion to their throughputs.
 
@@ -416,10 +413,12 @@ def _weigh_channels(
         media: media of the scene.
         beta: throughput at the start [1].
         passed: ray up to the end of the flight.
-        collision: collision at the end; None means the probability of flying this far.
-        flight: the flight, with its densities in grids; None if they are not known.
         active: lanes to weigh.
+        flight: the flight, with its densities in grids; None means the probability of flying this far.
+        collides: lanes whose flight ends at its collision.
     """
+    if media.channels == 1:
+        return mi.Spectrum(1)
     value = mi.Spectrum(1) if flight is None or not flight.densities else to_spectrum(flight.densities)
 
     def left(body: Body) -> list[Extinction]:
@@ -435,22 +434,14 @@ def _weigh_channels(
         tau = segment_optical_depth(media, passed, active, exact)
         least = minimum(tau)
         value *= to_spectrum([dr.exp(least - row) for row in tau])
-        hits = [] if collision is None else media.bodies_at(collision.body, collision.on & ~flight.has_density & active)
+        hits = [] if flight is None else media.bodies_at(flight.body, collides & ~flight.has_density & active)
         for body, on in hits:
             if any(body is other for other in coloured):
-                value = dr.select(on, value * _eval_parts(media, left(body), passed.ray, collision.t, on), value)
+                parts = [_eval_extinction(media, body, passed.ray, flight.t, on, part.name) for part in left(body)]
+                value = dr.select(on, value * sum(parts, mi.Spectrum(0)), value)
     shares = _channel_probabilities(beta)
     density = sum((p * v for p, v in zip(shares, to_components(value), strict=True)), mi.Float(0))
     return dr.select(density > 0, value / dr.select(density > 0, density, 1), 0)
-
-
-def _eval_parts(media: SceneMedia, parts: list[Extinction], ray: Ray, t: mi.Float64, on: mi.Bool) -> mi.Spectrum:
-    """Sum of some parts of a medium, without its scale [1/length]."""
-    total = mi.Spectrum(0)
-    for part in parts:
-        rows = part.eval_at(mi.Float(1), ray, dr.select(on, t, 0), on)
-        total += to_spectrum(to_scene_channels(rows, media.channels))
-    return total
 
 
 def make_collision(media: SceneMedia, ray: Ray, t: mi.Float64, body: mi.UInt32, on: mi.Bool) -> Collision:
