@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import mitsuba as mi
+
 from mivol.files.volume import VOXELS
 from mivol.scene.needs import MediumFacts, Needs
 from mivol.scene.survey import OwnRaysNoise
@@ -43,7 +45,9 @@ __all__ = [
     "choose_successive_paths",
     "choose_tracing",
     "choose_transport",
+    "draws_points",
     "is_scattering_visible",
+    "is_thin",
     "shares_cells",
 ]
 
@@ -123,6 +127,11 @@ DENSE = 70.0
 """Bound of the optical depth through a grid [1] from which segments also draw the light of an emitter near the grid in
 derivatives. Measured gain of segments in variance x time of gradients, by this bound (lamps 0.05 to 0.9 edges from smoke):
 3: 0.1, 35: 0.4 to 0.8, 69: 1.0, 104: 1.5, 208: 3.7, 416: 8 to 11. The gain in images falls meanwhile, from 30 to 1.2."""
+
+MAX_THIN_CELL = 0.85
+"""Bound of the optical depth along the edge of a cell [1] up to which look-ups at random points take fewer steps than a walk of
+cells. (Time of a gradient, by flights through rgb grids over that of inverted optical depths: 0.7 to 0.8 with 0.25, 1.06 with
+1.6. By near light at points over that in coarse cells: 0.78 to 0.9 with 0.15, 1.0 with 1.7.)"""
 
 MIN_FILLED_SHARE = 0.25
 """Share of occupied blocks above which a grid counts as filled."""
@@ -306,7 +315,7 @@ def choose_flights(medium: MediumFacts, segment: str) -> Choice | None:
     if not medium.resolutions:
         return Choice(subject, "exact", "its extinction is a constant")
     if medium.extinction == "rgb" and not tracks_flights(medium):
-        why = f"up to an optical depth of {medium.tau_max:.3g}, a walk of the cells takes fewer steps than tentative collisions"
+        why = f"with up to {medium.cell_depth:.3g} tentative collisions in a cell, a walk of the cells takes fewer steps"
         return Choice(subject, "exact, with one sampled channel per flight", why)
     if medium.extinction == "rgb":
         return Choice(
@@ -320,12 +329,29 @@ def choose_flights(medium: MediumFacts, segment: str) -> Choice | None:
 def tracks_flights(medium: MediumFacts) -> bool:
     """Whether delta tracking draws flights through the grids of a medium.
 
-    A flight in a clear channel of an rgb grid passes the tentative collisions of the densest channel. (Time of a gradient, over
-    that of inverted optical depths: 0.7 to 0.8 with optical depths of up to 14 in 32^3 voxels; 1.06, 1.5 and 2.8 with 68, 170
-    and 680 in 24^3. The variance is 1.05 to 1.14 times as large.)
+    A flight in a clear channel of an rgb grid passes the tentative collisions of the densest channel.
     """
-    cells = max((sum(res) for res in medium.resolutions), default=0)
-    return medium.extinction != "rgb" or 2 * (medium.tau_max or 0.0) <= cells
+    return medium.extinction != "rgb" or medium.cell_depth is None or is_thin(medium)
+
+
+def is_thin(medium: MediumFacts) -> bool:
+    """Whether look-ups at random points take fewer steps than a walk through the cells of a medium's grids."""
+    return medium.cell_depth is not None and medium.cell_depth <= MAX_THIN_CELL
+
+
+def draws_points(needs: Needs, settings: Settings) -> bool:
+    """Whether near light is drawn at points found by look-ups: in a single medium of thin grids that share their cells."""
+    if settings.shadows == "exact" or len(needs.media) != 1 or not is_thin(needs.media[0]):
+        return False
+    return all(_is_looked_up(view) for view in needs.views)
+
+
+def _is_looked_up(view: MediumView) -> bool:
+    """Whether one corner of a cell stands for the extinction at a point."""
+    if mi.is_monochromatic and view.channels > 1:
+        # A grey variant averages the channels; the transmittance of the mean is not the mean transmittance.
+        return False
+    return shares_cells(view) and all(part.lattice is not None and part.activation is None for part in view.parts)
 
 
 def count_occupied_cells(medium: MediumFacts) -> float:

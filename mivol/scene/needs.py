@@ -53,6 +53,7 @@ from mivol.transport.media.octree_extinction import OctreeExtinction
 from mivol.transport.media.phases import Phase
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.box import Box
+from mivol.transport.traversal.lattice import Lattice
 
 
 def find_needs(
@@ -287,6 +288,7 @@ def _read_medium_facts(boundary: Boundary, view: MediumView, survey: SceneSurvey
         occupied=occupied,
         tau_max=_bound_optical_depth(boundary, view, reads, survey),
         tau_min=_find_thinnest(boundary, view, survey),
+        cell_depth=_bound_cell_depth(grids, view, reads, survey),
         albedo_min=read_lowest_albedo(view, survey, boundary.name),
     )
 
@@ -312,6 +314,14 @@ def _bound_optical_depth(boundary: Boundary, view: MediumView, reads: list[GridR
     if boundary.box is None:
         return None
     return _read_scale(view, survey) * (sum(constants) + sum(bounds) + sum(r.maximum for r in reads)) * boundary.box.diameter
+
+
+def _bound_cell_depth(grids: list[Lattice], view: MediumView, reads: list[GridReading], survey: SceneSurvey) -> float | None:
+    """Bound the optical depth of the sum of a medium's grids along the edge of their smallest cells; None without a grid."""
+    if not grids:
+        return None
+    edge = min(abs(np.linalg.det(grid.to_world[:3, :3]) / math.prod(grid.res)) ** (1 / 3) for grid in grids)
+    return _read_scale(view, survey) * sum(r.maximum for r in reads) * edge
 
 
 def _read_scale(view: MediumView, survey: SceneSurvey) -> float:
@@ -343,6 +353,7 @@ class MediumFacts:
         occupied: smallest share of occupied blocks among the grids [1].
         tau_max: upper bound of the optical depth through the box [1]; None unless the boundary is a box.
         tau_min: optical depth of a homogeneous medium's clearest channel across its shape [1]; 0 for other media.
+        cell_depth: upper bound of the optical depth of the grids along the edge of a cell [1]; None if unknown.
         albedo_min: lowest albedo [1]; 0 for a medium with ``sigma_s``.
         unread: whether values could not be read because ``dr.freeze`` records.
         bounded: class of a field with only a known majorant along a ray; None with exact optical depths.
@@ -365,6 +376,7 @@ class MediumFacts:
     occupied: float
     tau_max: float | None
     tau_min: float = 0.0
+    cell_depth: float | None = None
     albedo_min: float = 0.0
     unread: bool = False
     bounded: str | None = None

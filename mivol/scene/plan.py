@@ -43,8 +43,10 @@ from mivol.scene.choices import (
     choose_tracing,
     choose_transport,
     count_occupied_cells,
+    draws_points,
     is_dense,
     is_scattering_visible,
+    is_thin,
     tracks_flights,
 )
 from mivol.scene.media_light import find_emitting_boxes
@@ -125,6 +127,7 @@ class Plan:
         image_branches: branches of a path at the first collision, in images; 1 for none.
         draws_near_light: whether segments of paths draw the light of emitters with a position, in images.
         near_light_in_derivatives: the same, in derivatives.
+        draws_points: whether they draw it at points found by look-ups, in place of coarse cells.
         near_emitters: numbers of the emitters inside of media.
         are_thick: whether collisions alone find the derivatives of each medium's extinction.
         have_low_albedo: whether some albedo of each medium may be too low for derivatives to be found at collisions.
@@ -153,6 +156,7 @@ class Plan:
     image_branches: int
     draws_near_light: bool
     near_light_in_derivatives: bool
+    draws_points: bool
     near_emitters: tuple[int, ...]
     are_thick: tuple[bool, ...]
     have_low_albedo: tuple[bool, ...]
@@ -181,7 +185,8 @@ class Plan:
     def readings(self, for_images: bool) -> tuple:
         """All that decides what is read of the values of media (:func:`read_parts`)."""
         near = self.draws_near_light if for_images else self.near_light_in_derivatives
-        return self.skips_empty, self.trims, self.estimates_shadows, self.tracks_flights, near
+        coarsens = near and not self.draws_points
+        return self.skips_empty, self.trims, self.estimates_shadows, self.tracks_flights, near, coarsens
 
 
 def find_skipping(occupied: float, is_sparse: bool) -> tuple[bool, bool]:
@@ -211,9 +216,9 @@ def plan_key(medium: MediumFacts) -> tuple:
         medium.occupied >= MIN_FILLED_SHARE,
         _round_share(medium.occupied),
     )
-    depth = is_dense(medium), tracks_flights(medium)
-    numbers = {"occupied": shares, "tau_max": depth, "tau_min": _is_thick(medium), "albedo_min": _is_dark(medium)}
-    return tuple((vars(medium) | numbers).values())
+    depths = {"tau_max": is_dense(medium), "tau_min": _is_thick(medium), "cell_depth": is_thin(medium)}
+    numbers = {"occupied": shares, "albedo_min": _is_dark(medium)}
+    return tuple((vars(medium) | depths | numbers).values())
 
 
 def _is_thick(medium: MediumFacts) -> bool:
@@ -307,6 +312,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         image_branches,
         near,
         near_in_derivatives,
+        (near or near_in_derivatives) and draws_points(needs, settings),
         tuple(k for k, distance in enumerate(needs.emitter_distances) if distance == 0),
         tuple(_is_thick(m) for m in needs.media),
         tuple(_is_dark(m) for m in needs.media),
@@ -400,10 +406,10 @@ Readings = list[list[PartReading]]
 
 def read_parts(needs: Needs, plan: Plan, survey: SceneSurvey, for_images: bool) -> Readings:
     """Read the values that the planned estimators need besides the values themselves."""
-    skips_empty, trims, estimates_shadows, tracks_flights, near = plan.readings(for_images)
+    skips_empty, trims, estimates_shadows, tracks_flights, near, coarsens = plan.readings(for_images)
     media = zip(needs.boundaries, needs.views, skips_empty, trims, estimates_shadows, tracks_flights, strict=True)
     return [
-        [read_part(p, survey, boundary.name, skip, trim, estimates or tracks, near) for p in view.parts]
+        [read_part(p, survey, boundary.name, skip, trim, estimates or tracks, near, coarsens) for p in view.parts]
         for boundary, view, skip, trim, estimates, tracks in media
     ]
 
@@ -478,7 +484,7 @@ def build_estimators(
     near = None
     if draws_near_light:
         inside = [scene.emitters()[number] for number in plan.near_emitters]
-        near = NearLighting(direct, 0.0 if for_images else PROBE_DEPTH, inside, settings.shadows != "exact")
+        near = NearLighting(direct, 0.0 if for_images else PROBE_DEPTH, inside, settings.shadows != "exact", plan.draws_points)
     mirrored = None
     if for_images and plan.keeps_mirrors:
         with dr.suspend_grad():

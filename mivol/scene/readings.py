@@ -220,7 +220,8 @@ def read_part(
     skips_empty: bool,
     trims: bool,
     tracks: bool,
-    draws_near_light: bool,
+    looks_up: bool,
+    coarsens: bool,
 ) -> PartReading:
     """Read what transport needs of a part, once for each state of its array.
 
@@ -229,7 +230,8 @@ def read_part(
         survey: keeps what was read.
         skips_empty, trims: whether walks skip empty blocks, and only before and behind the occupied ones.
         tracks: whether tracking needs the range of values of each block.
-        draws_near_light: whether the light of near emitters is drawn along segments.
+        looks_up: whether look-ups need the largest value.
+        coarsens: whether distances of near light are drawn in coarse cells.
     """
     lattice, reading = part.lattice, PartReading()
     if lattice is None:
@@ -244,11 +246,11 @@ def read_part(
     has_estimates = not (mi.is_monochromatic and part.channels > 1)
     if tracks and has_estimates:
         reading.block_ranges = read_block_ranges(part, survey, name)
-    if draws_near_light:
+    if looks_up and has_estimates:
+        reading.largest = read_largest(part, survey, name)
+    if coarsens:
         coarse = read_coarse_grid(survey, lattice, block_shift(lattice.res), False).lattice
         reading.rough, reading.rough_distances = coarse.values, coarse.empty_distances
-        if has_estimates:
-            reading.largest = read_largest(part, survey, name)
     return reading
 
 

@@ -152,6 +152,7 @@ def test_facts_with_the_same_key_have_the_same_decisions(monkeypatch: pytest.Mon
             "tau_max": 140 * rng.uniform(),
             "albedo_min": rng.uniform(),
             "tau_min": 2 * rng.uniform(),
+            "cell_depth": 2 * rng.uniform(),
         }
         facts = fog((100, 100, 180), **numbers)
         lit = {
@@ -173,16 +174,17 @@ def test_facts_with_the_same_key_have_the_same_decisions(monkeypatch: pytest.Mon
 
 
 CASES = [
-    (False, False, 2, False),
-    (True, False, 2, False),
-    (False, True, 2, False),
-    (False, False, 4, False),
-    (False, False, 4, True),
+    (False, False, 2, False, False),
+    (True, False, 2, False, False),
+    (False, True, 2, False, False),
+    (False, False, 4, False, False),
+    (False, False, 4, True, False),
+    (False, False, 4, True, True),
 ]
 
 
-@pytest.mark.parametrize(("skips", "tracks", "depth", "near"), CASES)
-def test_a_grid_has_what_the_plan_asks_for(skips: bool, tracks: bool, depth: int, near: bool) -> None:
+@pytest.mark.parametrize(("skips", "tracks", "depth", "near", "points"), CASES)
+def test_a_grid_has_what_the_plan_asks_for(skips: bool, tracks: bool, depth: int, near: bool, points: bool) -> None:
     """Nothing is read from the grid that no estimator will ask for."""
     values = np.zeros((8, 8, 8, 1), np.float32)
     values[2:4, 2:4, 2:4] = 1
@@ -191,12 +193,12 @@ def test_a_grid_has_what_the_plan_asks_for(skips: bool, tracks: bool, depth: int
     needs = find_needs(scene, scene.sensors()[0], survey)
     plan = make_plan(needs, settings)
     assert (plan.segment == "free_flight") == (depth == 4)
-    plan = replace(plan, skips_empty=(skips,), estimates_shadows=(tracks,), draws_near_light=near)
+    plan = replace(plan, skips_empty=(skips,), estimates_shadows=(tracks,), draws_near_light=near, draws_points=points)
     media = build_media(scene, needs, plan, survey)
     ((part,),) = [body.view.parts for body in media.bodies]
     assert (part.lattice.empty_distances is not None) == skips
     assert (part.lattice.block_ranges is not None) == (tracks or depth == 4)
-    assert (part.rough is not None) == near
+    assert (part.rough is not None) == (near and not points)
     assert (part.largest[0] if near else part.largest) == (1 if near else None)
     assert media.bodies[0].estimates_shadows == tracks
     assert not media.has_surfaces

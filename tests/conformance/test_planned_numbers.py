@@ -34,9 +34,10 @@ def medium(name: str = "fog", **more: object) -> MediumFacts:
 
 MEDIA = {
     "fog": medium(),
-    "thin": medium(occupied=plan.MAX_SKIPPED_SHARE / 2, mean_cosine=0.8, tau_max=choices.DENSE),
+    "thin": medium(occupied=plan.MAX_SKIPPED_SHARE / 2, mean_cosine=0.8, tau_max=choices.DENSE, cell_depth=0.85),
     "filled": medium(occupied=1.0, resolutions=((100, 100, 100),), mean_cosine=choices.MIN_SIDE_FLIGHT_COSINE),
     "large": medium(resolutions=((400, 400, 400),), occupied=plan.MAX_TRIMMED_SHARE, extinction="rgb", tau_max=69.9),
+    "rgb": medium(extinction="rgb", cell_depth=0.86),
     "even": medium(resolutions=(), occupied=0.0, tau_min=plan.THICK, albedo_min=plan.MIN_ALBEDO),
     "sparse": medium(resolutions=((800, 80, 80),), bricks=(40,), occupied=0.1),
     "fire": medium(emits=True, is_scattering=False),
@@ -132,9 +133,9 @@ def by_rays() -> Iterator[float]:
 
 
 PLANS: dict[str, tuple[Callable[[], Iterator[float]], float]] = {
-    "media": (by_medium, -31.888370468),
-    "noise": (by_noise, 199.6721490774),
-    "limits": (by_limit, 478.2462317793),
+    "media": (by_medium, -97.17581107188),
+    "noise": (by_noise, 278.7693459565),
+    "limits": (by_limit, 408.1361292976),
     "paths of a baseline": (by_rays, -1.81897295049),
 }
 """Scenes, and the sum of all numbers of their plans, each times a weight of its place."""

@@ -43,6 +43,7 @@ __all__ = [
     "ratio_tracking_in_grid",
     "delta_tracking_in_blocks",
     "delta_tracking",
+    "make_node_finder",
 ]
 
 
@@ -158,7 +159,7 @@ def _make_corner_sampler(
     Each corner has its trilinear weight as probability, by three uniform random numbers; the result is the index of its node,
     and the lanes in which it is stored.
     """
-    shift, find_node = lattice.block_ranges.shift, _make_node_finder(lattice)
+    shift, find_node = lattice.block_ranges.shift, make_node_finder(lattice)
     is_ascending, speed = segment.d > 0, dr.abs(segment.d) * 2.0**-shift
 
     def draw_corner(cell: Cell, dt: mi.Float, u: list[mi.Float], active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
@@ -170,7 +171,7 @@ def _make_corner_sampler(
     return draw_corner
 
 
-def _make_node_finder(lattice: Lattice) -> Callable[[mi.Vector3i, mi.Bool], tuple[mi.UInt32, mi.Bool]]:
+def make_node_finder(lattice: Lattice) -> Callable[[mi.Vector3i, mi.Bool], tuple[mi.UInt32, mi.Bool]]:
     """Make ``find_node(node, active)``: the index of a node, clamped to the grid, and the lanes in which it is stored."""
     res, bricks = lattice.res, lattice.bricks
 
@@ -254,7 +255,7 @@ def ratio_tracking_in_grid(
     largest extinction is k times the rate. Cost: ``rate`` times the length look-ups of one node each.
     """
     values, length, pace, channels = dr.detach(lattice.values.array), segment.length, dr.rcp(rate), lattice.channels
-    find_node = _make_node_finder(lattice)
+    find_node = make_node_finder(lattice)
     entry, d = mi.Vector3f(segment.cell) + segment.frac, segment.d
 
     def step(s: mi.Float, T: list[mi.Float], rng: mi.UInt32, on: mi.Bool) -> tuple:

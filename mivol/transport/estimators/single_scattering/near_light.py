@@ -4,8 +4,9 @@ r"""Light of near emitters scattered along a segment of a path, at a distance dr
 
 A path that scatters many times flies freely, and its collisions are drawn by the extinction alone. The light of an emitter with
 a position falls as 1 / r^2, so its light at collisions has a heavy tail. Here every segment draws a second distance, by the
-extinguished light and the angle seen from the emitter together (:mod:`.distance_sampling`), and adds the light of near emitters
-there. The collision adds none. So the variance is the variance of single scattering, for every order of scattering.
+extinguished light and the angle seen from the emitter together (:mod:`.distance_sampling`, in thin grids :mod:`.near_points`),
+and adds the light of near emitters there. The collision adds none. So the variance is the variance of single scattering, for
+every order of scattering.
 
 Directions. The light of a point emitter that is scattered along a ray falls as 1 / sin(theta) with the angle between the ray
 and the direction towards the emitter. Directions of a phase function or BSDF alone would find its square as 1 / sin^2(theta),
@@ -31,17 +32,19 @@ import mitsuba as mi
 
 from mivol.phase.closed_forms import angle_between, eval_hg, sample_hg, scattered_direction
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DirectLighting
-from mivol.transport.estimators.lighting.emitters import join_arrays
+from mivol.transport.estimators.lighting.emitters import ChosenEmitter, join_arrays
 from mivol.transport.estimators.lighting.shadow_rays import segment_transmittance
 from mivol.transport.estimators.lighting.tabulated_shadows import TabulatedShadow
 from mivol.transport.estimators.lighting.vertex import MediumVertex
 from mivol.transport.estimators.segment import PathSegment
 from mivol.transport.estimators.single_scattering.distance_sampling import (
     DistanceProposal,
+    MediumEvent,
     refill_reservoir,
     sample_distance,
     start_reservoir,
 )
+from mivol.transport.estimators.single_scattering.near_points import draw_near_point
 from mivol.transport.estimators.single_scattering.single_scattering import (
     ScatteredLight,
     Scattering,
@@ -216,18 +219,27 @@ class NearLighting:
         probe_depth: optical depth added over a medium for derivatives [1]; 0 for images.
         inside: emitters inside media that scatter. Directions are drawn around these emitters only.
         looks_up: whether few look-ups may estimate transmittances of thin grids, behind camera rays and in derivatives.
+        draws_points: whether points found by look-ups take the place of cells (:mod:`.near_points`).
 
     Attributes:
         emitters: the emitters with a position.
         lights_vertices: collisions draw the other emitters, at infinity.
         aims: some emitter lies inside a medium.
 
-    Bias: none. Variance: one distance and one point on one emitter. Cost: a walk of the segment, one up to the drawn distance,
-    and a shadow ray; look-ups in place of the last two in thin grids.
+    Bias: none. Variance: one distance and one point on one emitter. Cost: a walk of coarse cells along the segment, one up to
+    the drawn distance, and a shadow ray; look-ups in place of all in thin grids.
     """
 
-    def __init__(self, direct: DirectLighting, probe_depth: float, inside: list[mi.Emitter], looks_up: bool = True) -> None:
-        self.direct, self.media, self.probe_depth, self.looks_up = direct, direct.media, probe_depth, looks_up
+    def __init__(
+        self,
+        direct: DirectLighting,
+        probe_depth: float,
+        inside: list[mi.Emitter],
+        looks_up: bool = True,
+        draws_points: bool = False,
+    ) -> None:
+        self.direct, self.media, self.probe_depth = direct, direct.media, probe_depth
+        self.looks_up, self.draws_points = looks_up, draws_points
         # Their tables are made here, outside of recorded loops.
         self.emitters = direct.near_emitters
         self.lights_vertices = bool(direct.far_emitters.sampled)
@@ -312,16 +324,9 @@ class NearLighting:
             looks_up = mi.Bool(True) if self.probe_depth else segment.depth > 0
         # -- The distance ------------------------------------------------------------------------------------------------
         chosen = self.emitters.choose_emitter(ray, samples.which_emitter)
-        proposal = DistanceProposal(media, ray, chosen, None, self.probe_depth, is_rough=True)
         passed = RaySegment(ray, segment.medium, length)
-        reservoir = refill_reservoir(proposal, passed, start_reservoir(media, [rng]), on)
-        (candidate,) = reservoir.candidates
-        event = sample_distance(proposal, candidate, reservoir.total, samples.inside, on)
-        T = transmittance(event.tau)
-        if not proposal.is_exact:
-            before = RaySegment.upto(ray, segment.medium, event.t)
-            T = segment_transmittance(media, before, event.on, fork_state(candidate.rng, 1), looks_up)
-        reach = dr.select(event.on, T / event.pdf, 0)
+        draw = self._draw_point if self.draws_points else self._draw_in_cells
+        event, reach, is_exact, rng = draw(passed, chosen, samples, rng, looks_up, on)
         if known is not None:
             place, is_known = known
             event.t, event.body = dr.select(is_known, place.t, event.t), dr.select(is_known, place.body, event.body)
@@ -335,8 +340,8 @@ class NearLighting:
         sample = self.direct.sample_near_emitter(mei, chosen, samples.emitter, event.on)
         vertex = MediumVertex(media, mei, point_along(ray, event.t))
         shadows = None if known is None else (known[0].shadow, known[1])
-        direct = self.direct.estimate_at_vertex(vertex, sample, attached, event.on, candidate.rng, shadows, looks_up)
-        sigma_t, sigma_s = event_coefficients(media, ray, event, mei, proposal.is_exact)
+        direct = self.direct.estimate_at_vertex(vertex, sample, attached, event.on, rng, shadows, looks_up)
+        sigma_t, sigma_s = event_coefficients(media, ray, event, mei, is_exact)
         light = ScatteredLight(media, segment, Scattering(event, mei, gain, [direct], sigma_t, sigma_s, chance))
         shadow = DirectLight(media, direct.ray_segment, light.value, direct.on)
         found = [to_spectrum(event.sigma_t), mi.Spectrum(reach), mi.Spectrum(direct.T)]
@@ -344,3 +349,43 @@ class NearLighting:
         if direct.shadow is None:
             return NearLight(light, shadow, chance, place)
         return NearLight(light, shadow, chance, place, direct.shadow.times(sigma_s * gain))
+
+    def _draw_in_cells(
+        self,
+        passed: RaySegment,
+        chosen: ChosenEmitter,
+        samples: NearLightSamples,
+        rng: mi.UInt32,
+        looks_up: mi.Bool | None,
+        active: mi.Bool,
+    ) -> tuple[MediumEvent, mi.Spectrum, bool, mi.UInt32]:
+        """Draw a distance in one of the cells of coarse grids, or in a homogeneous medium.
+
+        Returns:
+            The event, the transmittance up to the event over the density of the distance, whether its extinction is known, and
+            the state of the generator.
+        """
+        proposal = DistanceProposal(self.media, passed.ray, chosen, None, self.probe_depth, is_rough=True)
+        reservoir = refill_reservoir(proposal, passed, start_reservoir(self.media, [rng]), active)
+        (candidate,) = reservoir.candidates
+        event = sample_distance(proposal, candidate, reservoir.total, samples.inside, active)
+        T = transmittance(event.tau)
+        if not proposal.is_exact:
+            before = RaySegment.upto(passed.ray, passed.medium, event.t)
+            T = segment_transmittance(self.media, before, event.on, fork_state(candidate.rng, 1), looks_up)
+        return event, dr.select(event.on, T / event.pdf, 0), proposal.is_exact, candidate.rng
+
+    def _draw_point(
+        self,
+        passed: RaySegment,
+        chosen: ChosenEmitter,
+        samples: NearLightSamples,
+        rng: mi.UInt32,
+        looks_up: mi.Bool | None,
+        active: mi.Bool,
+    ) -> tuple[MediumEvent, mi.Spectrum, bool, mi.UInt32]:
+        """The same by look-ups in thin grids."""
+        point = draw_near_point(self.media, passed, chosen.equiangular, self.probe_depth, rng, active)
+        unknown = [mi.Float(0) for _ in range(self.media.channels)]
+        event = MediumEvent(point.t, point.t, mi.Float(1), unknown, unknown, point.body, point.on)
+        return event, point.reach, False, point.rng
