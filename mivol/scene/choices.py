@@ -340,7 +340,7 @@ def is_thin(medium: MediumFacts) -> bool:
 
 
 def draws_points(needs: Needs, settings: Settings) -> bool:
-    """Whether near light is drawn at points found by look-ups: in a single medium of thin grids that share their cells."""
+    """Whether near light is drawn at points found by look-ups: in a single medium with an albedo and a thin grid."""
     if settings.shadows == "exact" or len(needs.media) != 1 or not is_thin(needs.media[0]):
         return False
     return all(_is_looked_up(view) for view in needs.views)
@@ -348,10 +348,11 @@ def draws_points(needs: Needs, settings: Settings) -> bool:
 
 def _is_looked_up(view: MediumView) -> bool:
     """Whether one corner of a cell stands for the extinction at a point."""
-    if mi.is_monochromatic and view.channels > 1:
-        # A grey variant averages the channels; the transmittance of the mean is not the mean transmittance.
+    (part,) = view.parts if len(view.parts) == 1 else (None,)
+    if part is None or view.albedo is None or part.lattice is None or part.activation is not None:
         return False
-    return shares_cells(view) and all(part.lattice is not None and part.activation is None for part in view.parts)
+    # A grey variant averages the channels; the transmittance of the mean is not the mean transmittance.
+    return not (mi.is_monochromatic and view.channels > 1)
 
 
 def count_occupied_cells(medium: MediumFacts) -> float:

@@ -22,15 +22,11 @@ LAMP = np.array([0.1, 0.7, 0.2])
 """A ray that enters the box [-1, 1]^3 behind 2.08 and ends inside, and a lamp beside it."""
 
 
-def draw(parts: dict[str, np.ndarray], probe_depth: float = 0.0, lamp: np.ndarray = LAMP) -> NearPoint:
-    """Points of ``N`` equal rays through a medium of grids."""
-    grids = {name: grid_volume("mivol_voxels", values, PLACE) for name, values in parts.items()}
-    interior = {"type": "mivol_medium", "albedo": 0.5, **grids}
-    if "sigma_s" in parts:
-        del interior["albedo"]
+def draw(values: np.ndarray, probe_depth: float = 0.0, lamp: np.ndarray = LAMP) -> NearPoint:
+    """Points of ``N`` equal rays through a grid."""
+    interior = {"type": "mivol_medium", "albedo": 0.5, "sigma_t": grid_volume("mivol_voxels", values, PLACE)}
     media = media_of(close_up({"smoke": box_of(interior, PLACE)}, res=1))
-    for part in media.bodies[0].view.parts:
-        part.largest = mi.Float(float(parts[part.name].max()))
+    media.bodies[0].view.parts[0].largest = mi.Float(float(values.max()))
     o, d = dr.full(mi.Point3f, 0, N) + mi.Point3f(ORIGIN.tolist()), mi.Vector3f(TOWARDS.tolist())
     ray = mi.Ray3f(o, d, 10, mi.Float(0), mi.Color0f())
     rng = seed_pcg32(mi.Float((0.7 + 0.618 * fresh(0)) % 1), N)
@@ -55,49 +51,44 @@ def squared_distance(t: np.ndarray) -> np.ndarray:
 
 
 RGB = np.concatenate([rough_grid(3), 0.3 * rough_grid(4), 0.05 * rough_grid(5)], axis=-1)
-MEDIA = {
-    "thin": {"sigma_t": 0.3 * rough_grid(1)},
-    "roulette": {"sigma_t": 4 * rough_grid(2)},
-    "rgb": {"sigma_t": RGB},
-    "two grids": {"sigma_a": 0.4 * rough_grid(6), "sigma_s": 0.7 * rough_grid(7)},
-    "grey and rgb": {"sigma_a": RGB, "sigma_s": rough_grid(8)},
-}
+GRIDS = {"thin": 0.3 * rough_grid(1), "roulette": 4 * rough_grid(2), "rgb": RGB, "holes": np.maximum(rough_grid(6) - 0.6, 0)}
 
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("probe_depth", [0.0, 4.0], ids=["image", "derivatives"])
-@pytest.mark.parametrize("name", MEDIA)
+@pytest.mark.parametrize("name", GRIDS)
 def test_means_are_integrals_along_the_ray(name: str, probe_depth: float) -> None:
-    """The mean of reach times a function of the place is the integral of the function times the transmittance, in each channel:
-    for the light scattered by a sum of the grids, for that of a medium of constant scattering, and for its half near the
-    camera."""
-    parts = MEDIA[name]
-    point = draw(parts, probe_depth)
-    t, reach, on = (np.array(a, np.float64) for a in (point.t, point.reach, point.on))
+    """The mean of the reach times a function of place and extinction is its integral times the transmittance, in each channel:
+    of the scattered light, and of that in the half near the camera. Derivatives ask for functions of the place alone, too.
+    """
+    values = GRIDS[name]
+    point = draw(values, probe_depth)
+    t, reach, on, here = (np.array(a, np.float64) for a in (point.t, point.reach, point.on, point.sigma_t))
     assert np.all(reach >= 0) and np.all(reach[:, on == 0] == 0) and np.mean(on) > 0.99
 
     # The box is entered at 2 / 0.96; 4e5 steps of the trapezium rule have errors below 1e-9.
     steps = np.linspace(2 / 0.96, LENGTH, 400_001)
-    sigma = sum(along(values, steps) for values in parts.values())
+    sigma = along(values, steps)
     tau = np.zeros_like(sigma)
     tau[1:] = np.cumsum((sigma[1:] + sigma[:-1]) / 2, axis=0) * (steps[1] - steps[0])
-    here = sum(along(values, t) for values in parts.values())
     functions = {
-        "scattered": lambda s, t: s / squared_distance(t)[:, None],
-        "even": lambda s, t: np.ones_like(s) / squared_distance(t)[:, None],
-        "front": lambda s, t: np.where(t < 2.8, 1, 0)[:, None] * s,
+        "scattered": lambda s, t: s / squared_distance(t),
+        "in front": lambda s, t: np.where(t < 2.8, s, 0),
+        "even": lambda s, t: 1 / squared_distance(t),
     }
     for what, f in functions.items():
-        truth = np.trapezoid(np.exp(-tau) * f(sigma, steps), steps, axis=0)
+        if what == "even" and not probe_depth:
+            continue
         for c in range(sigma.shape[1]):
-            found = reach[c] * f(here, t)[:, c]
+            truth = np.trapezoid(np.exp(-tau[:, c]) * f(sigma[:, c], steps), steps)
+            found = reach[c] * f(here[c], t)
             lanes = Estimate(found.mean(), found.var(ddof=1) / N, N - 1)
-            assert_same_mean(lanes, truth[c], rounding=1e-4 * truth[c], what=f"{what}, channel {c}")
+            assert_same_mean(lanes, truth, rounding=1e-4 * truth, what=f"{what}, channel {c}")
 
 
 def test_in_an_empty_grid_points_are_spread_over_the_angle() -> None:
     """Derivatives of an empty grid: all points have one weight, so the reach times 1 / r^2 is the angle over its height."""
-    point = draw({"sigma_t": np.zeros((4, 4, 4, 1), np.float32)}, 4.0)
+    point = draw(np.zeros((4, 4, 4, 1), np.float32), 4.0)
     t, reach = np.array(point.t), np.array(point.reach)[0]
     begin, end = ((ORIGIN + s * TOWARDS - LAMP) for s in (2 / 0.96, LENGTH))
     height = np.linalg.norm(np.cross(begin, TOWARDS))
@@ -111,14 +102,14 @@ def test_in_an_empty_grid_points_are_spread_over_the_angle() -> None:
 
 
 def test_an_empty_grid_scatters_no_light() -> None:
-    point = draw({"sigma_t": np.zeros((4, 4, 4, 1), np.float32)})
+    point = draw(np.zeros((4, 4, 4, 1), np.float32))
     assert not np.any(point.on) and not np.any(np.array(point.reach))
 
 
 def test_a_lamp_on_the_ray() -> None:
     """The smallest height of an angle is 2e-6 of the distance; all numbers are finite, and all points in the box."""
     for probe_depth in (0.0, 4.0):
-        point = draw({"sigma_t": 0.3 * rough_grid(1)}, probe_depth, ORIGIN + 3.0 * TOWARDS)
+        point = draw(0.3 * rough_grid(1), probe_depth, ORIGIN + 3.0 * TOWARDS)
         on = np.array(point.on)
         assert on.mean() > 0.99 and np.all(np.isfinite(np.array(point.reach)))
         assert np.array(point.t)[on].min() >= 2 / 0.96 - 1e-6 and np.array(point.t)[on].max() <= LENGTH

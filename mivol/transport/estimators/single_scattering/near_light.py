@@ -384,8 +384,8 @@ class NearLighting:
         looks_up: mi.Bool | None,
         active: mi.Bool,
     ) -> tuple[MediumEvent, mi.Spectrum, bool, mi.UInt32]:
-        """The same by look-ups in thin grids."""
+        """The same by look-ups in a thin grid; the extinction is that of a corner of the cell."""
         point = draw_near_point(self.media, passed, chosen.equiangular, self.probe_depth, rng, active)
         unknown = [mi.Float(0) for _ in range(self.media.channels)]
-        event = MediumEvent(point.t, point.t, mi.Float(1), unknown, unknown, point.body, point.on)
-        return event, point.reach, False, point.rng
+        event = MediumEvent(point.t, point.t, mi.Float(1), unknown, point.sigma_t, point.body, point.on)
+        return event, point.reach, True, point.rng
