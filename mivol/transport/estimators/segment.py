@@ -27,16 +27,18 @@ from mivol.transport.estimators.scores import Factor, Term
 from mivol.transport.media.optical_depth import (
     integrate_optical_depth,
     jvp_optical_depth,
+    segment_optical_depth,
     transmittance,
     vjp_optical_depth,
 )
-from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd, UniformPoint
+from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd, UniformPoint, find_end
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.random_numbers import SpreadSampler, draw_pcg32, draw_state, fork_state
 from mivol.transport.traversal.rays import Ray
 
 __all__ = [
     "Absorption",
+    "AbsorptionToLamps",
     "Collision",
     "FlightPoint",
     "KnownFlight",
@@ -294,6 +296,22 @@ class Absorption:
 
     def replayed(self) -> Absorption:
         return self
+
+
+class AbsorptionToLamps(Absorption):
+    """The same for the light of lamps seen directly: media are walked only in front of a lamp, and of a surface that may let the
+    light of a lamp behind it pass. Other rays carry no light, and have a transmittance of 1.
+
+    Cost: one walk of each medium, in packets of rays that see a lamp.
+    """
+
+    def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
+        end = find_end(self.media, segment.ray, segment.medium, active)
+        hit = active & end.si.is_valid()
+        lit = hit & ((end.si.emitter(self.media.scene, hit) != None) | mi.has_flag(end.si.bsdf().flags(), mi.BSDFFlags.Null))
+        passed = RaySegment(segment.ray, segment.medium, end.t)
+        tau = segment_optical_depth(self.media, passed, lit)
+        return SegmentEstimate(end, transmittance(tau), None, Transmittance(self.media, passed, active))
 
 
 class TrackedAbsorption:

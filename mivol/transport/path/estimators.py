@@ -17,7 +17,7 @@ from mivol.transport.estimators.lighting.emission_sampling import EmissionSampli
 from mivol.transport.estimators.lighting.kept_rays import KeptMirror, KeptRay, MirroredEmitters
 from mivol.transport.estimators.lighting.refracted_light import RefractedLighting
 from mivol.transport.estimators.lighting.tabulated_shadows import KeptShadow, TransmittanceGrid
-from mivol.transport.estimators.segment import Absorption, SegmentEstimator, TrackedAbsorption
+from mivol.transport.estimators.segment import Absorption, AbsorptionToLamps, SegmentEstimator, TrackedAbsorption
 from mivol.transport.estimators.single_scattering.near_light import NearLighting
 from mivol.transport.estimators.single_scattering.scattering_quadrature import ScatteringQuadrature
 from mivol.transport.estimators.single_scattering.single_scattering import SingleScattering
@@ -307,7 +307,7 @@ class Estimators:
     def of_lamps(self) -> Estimators:
         """The estimators of the light of lamps that reaches the camera without scattering."""
         settings = replace(self.settings, max_depth=1)
-        return Estimators(self.direct, Absorption(self.media), settings, lights_surfaces=False, shows="lamps")
+        return Estimators(self.direct, AbsorptionToLamps(self.media), settings, lights_surfaces=False, shows="lamps")
 
     def of_camera_emission(self) -> Estimators:
         """The estimators of the light that media emit towards the camera, attenuated and without scattering."""
