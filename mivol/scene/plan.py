@@ -185,8 +185,8 @@ class Plan:
     def readings(self, for_images: bool) -> tuple:
         """All that decides what is read of the values of media (:func:`read_parts`)."""
         near = self.draws_near_light if for_images else self.near_light_in_derivatives
-        coarsens = near and not self.draws_points
-        return self.skips_empty, self.trims, self.estimates_shadows, self.tracks_flights, near, coarsens
+        looks_up, coarsens = self.segment == "free_flight", near and not self.draws_points
+        return self.skips_empty, self.trims, self.estimates_shadows, self.tracks_flights, looks_up, coarsens
 
 
 def find_skipping(occupied: float, is_sparse: bool) -> tuple[bool, bool]:
@@ -406,10 +406,10 @@ Readings = list[list[PartReading]]
 
 def read_parts(needs: Needs, plan: Plan, survey: SceneSurvey, for_images: bool) -> Readings:
     """Read the values that the planned estimators need besides the values themselves."""
-    skips_empty, trims, estimates_shadows, tracks_flights, near, coarsens = plan.readings(for_images)
+    skips_empty, trims, estimates_shadows, tracks_flights, looks_up, coarsens = plan.readings(for_images)
     media = zip(needs.boundaries, needs.views, skips_empty, trims, estimates_shadows, tracks_flights, strict=True)
     return [
-        [read_part(p, survey, boundary.name, skip, trim, estimates or tracks, near, coarsens) for p in view.parts]
+        [read_part(p, survey, boundary.name, skip, trim, estimates or tracks, looks_up, coarsens) for p in view.parts]
         for boundary, view, skip, trim, estimates, tracks in media
     ]
 
@@ -457,6 +457,7 @@ def build_estimators(
         media = media.by_quadrature()
     # Candidates would lengthen gradients by a tenth.
     direct = DirectLighting(media, emitters, resamples=for_images, bright=bright if for_images else None)
+    direct.looks_up = not for_images and plan.segment == "free_flight" and settings.shadows != "exact"
     choice = SegmentInputs(direct, plan.scattering_points)
     if plan.segment in ("single_scattering", "scattering_quadrature"):
         with dr.suspend_grad():

@@ -181,14 +181,16 @@ class DirectLighting:
 
     Attributes:
         shadow_table: table of the shadows of vertices in media, in images; None for shadow rays.
+        looks_up: whether few look-ups may estimate all shadows of thin grids, in derivatives.
     """
 
     shadow_table: TransmittanceGrid | None
+    looks_up: bool
 
     def __init__(
         self, media: SceneMedia, emitters: mi.Float | None = None, resamples: bool = True, bright: BrightMap | None = None
     ) -> None:
-        self.media, self.shadow_table, self._numbers = media, None, emitters
+        self.media, self.shadow_table, self.looks_up, self._numbers = media, None, False, emitters
         self._resamples, self._bright = resamples, bright
 
     @property
@@ -258,6 +260,8 @@ class DirectLighting:
         Bias: none. Variance: one emitter sample. Cost: one shadow ray.
         """
         direct, it = sample.direct, vertex.interaction
+        if self.looks_up and rng is not None:
+            looks_up = mi.Bool(True)
         # At the place of a lamp to all digits, its light would be infinite.
         on = active & (direct.pdf > 0) & (direct.dist > 0)
         scattered, pdf = vertex.eval_and_pdf(direct.d, on)
