@@ -116,6 +116,7 @@ class Plan:
         trims: whether only those before the first and behind the last occupied block of a ray are skipped.
         estimates_shadows: whether shadows of each medium are estimated in images.
         tracks_flights: whether delta tracking draws flights through the grids of each medium.
+        are_thin: whether look-ups at points take fewer steps than walks through the grids of each medium.
         segment: name of the segment estimator in :data:`mivol.transport.path.estimators.SEGMENT_ESTIMATORS`.
         scattering_points: scattering points per camera ray in images.
         pass_rays: most rays of a pass.
@@ -145,6 +146,7 @@ class Plan:
     trims: tuple[bool, ...]
     estimates_shadows: tuple[bool, ...]
     tracks_flights: tuple[bool, ...]
+    are_thin: tuple[bool, ...]
     segment: str
     scattering_points: int
     pass_rays: int
@@ -185,7 +187,8 @@ class Plan:
     def readings(self, for_images: bool) -> tuple:
         """All that decides what is read of the values of media (:func:`read_parts`)."""
         near = self.draws_near_light if for_images else self.near_light_in_derivatives
-        looks_up, coarsens = self.segment == "free_flight", near and not self.draws_points
+        looks_up = tuple(self.segment == "free_flight" and thin for thin in self.are_thin)
+        coarsens = near and not self.draws_points
         return self.skips_empty, self.trims, self.estimates_shadows, self.tracks_flights, looks_up, coarsens
 
 
@@ -301,6 +304,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         trims,
         tracks,
         tuple(segment == "free_flight" and tracks_flights(m) for m in needs.media),
+        tuple(is_thin(m) for m in needs.media),
         segment,
         events,
         pass_rays,
@@ -407,10 +411,10 @@ Readings = list[list[PartReading]]
 def read_parts(needs: Needs, plan: Plan, survey: SceneSurvey, for_images: bool) -> Readings:
     """Read the values that the planned estimators need besides the values themselves."""
     skips_empty, trims, estimates_shadows, tracks_flights, looks_up, coarsens = plan.readings(for_images)
-    media = zip(needs.boundaries, needs.views, skips_empty, trims, estimates_shadows, tracks_flights, strict=True)
+    media = zip(needs.boundaries, needs.views, skips_empty, trims, estimates_shadows, tracks_flights, looks_up, strict=True)
     return [
-        [read_part(p, survey, boundary.name, skip, trim, estimates or tracks, looks_up, coarsens) for p in view.parts]
-        for boundary, view, skip, trim, estimates, tracks in media
+        [read_part(p, survey, boundary.name, skip, trim, estimates or tracks, looks, coarsens) for p in view.parts]
+        for boundary, view, skip, trim, estimates, tracks, looks in media
     ]
 
 

@@ -230,7 +230,7 @@ def read_part(
         survey: keeps what was read.
         skips_empty, trims: whether walks skip empty blocks, and only before and behind the occupied ones.
         tracks: whether tracking needs the range of values of each block.
-        looks_up: whether look-ups need the largest value.
+        looks_up: whether look-ups need the largest value of the grid.
         coarsens: whether distances of near light are drawn in coarse cells.
     """
     lattice, reading = part.lattice, PartReading()

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from mivol.transport.estimators.scores import IMAGE
-from mivol.transport.estimators.segment import Absorption, PathSegment, SegmentLight, SegmentTransmittance
+from mivol.transport.estimators.segment import (
+    Absorption,
+    AbsorptionToLamps,
+    PathSegment,
+    SegmentLight,
+    SegmentTransmittance,
+)
 from scenes import box_of, camera, centred, media_of, medium
 
 KEY = "box.interior_medium.sigma_t.value.value"
@@ -54,6 +60,28 @@ def test_absorption_draws_for_the_estimator_whose_path_it_follows():
     assert absorption.draw("sampler", "active") is None and other.said == [("sampler", "active")]
     assert Absorption(None).draw("sampler", "active") is None
     assert absorption.replayed() is absorption
+
+
+def test_media_are_walked_in_front_of_lamps_only():
+    """A lamp, a wall, a mask that lets half of the light pass, and nothing, each behind a quarter of a box: T = exp(-0.5) in
+    front of the lamp and of the mask. The ends are those of a walk."""
+    place = mi.ScalarTransform4f().translate([0, 0, 2]).rotate([0, 1, 0], 180)
+    mask = {"type": "mask", "opacity": 0.5, "nested": {"type": "diffuse"}}
+    kinds = {"lamp": {"emitter": {"type": "area"}}, "wall": {"bsdf": {"type": "diffuse"}}, "mask": {"bsdf": mask}}
+    x = np.float32([-0.375, -0.125, 0.125, 0.375])
+    squares = {
+        name: {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([float(a), 0, 0]) @ place.scale(0.1), **more}
+        for a, (name, more) in zip(x, kinds.items(), strict=False)
+    }
+    box = box_of(medium("mivol_medium", 0.5), centred(np.eye(3)))
+    media = media_of(mi.load_dict({"type": "scene", "box": box, "sensor": camera([0, -4, 0], [0, 0, 0]), **squares}))
+    ray = mi.Ray3f(mi.Point3f(mi.Float(x), 0, -3), mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
+    segment = PathSegment(ray, dr.zeros(mi.MediumPtr, 4), mi.Spectrum(1), mi.Bool(True), None, mi.UInt32(0))
+    with dr.suspend_grad():
+        walked, found = (kind(media).estimate(segment, IMAGE, mi.Bool(True)) for kind in (Absorption, AbsorptionToLamps))
+    np.testing.assert_allclose(np.array(found.T)[0], np.exp([-0.5, 0, -0.5, 0]), rtol=4 * 2.0**-23)
+    np.testing.assert_array_equal(np.array(found.end.t), np.array(walked.end.t))
+    assert np.array(found.end.si.is_valid()).tolist() == [True, True, True, False]
 
 
 def test_absorption_is_beers_law_with_its_derivatives():

@@ -380,3 +380,54 @@ def test_refusals(setting, words):
     glass = ball_of(medium("homogeneous", 1.0, 0.8), (0, 0, 0), 1.0) | {"bsdf": {"type": "dielectric"}}
     scene = close_up({"milk": glass, "lamp": lamp()}, res=8)
     assert_refused(words, scenes.render, scene, mivol(max_depth=4, near_light=setting), 1)
+
+
+def _two_grids() -> dict:
+    interior = {
+        name: scenes.grid_volume("mivol_voxels", rough_grid(seed, 0.5), PLACE)
+        for seed, name in enumerate(("sigma_a", "sigma_s"))
+    }
+    return box_of({"type": "mivol_medium", **interior}, PLACE)
+
+
+BESIDE = np.diag([1.0, 1.0, 1.0, 1.0])
+BESIDE[:3, 3] = 4, 0, 0
+
+
+@pytest.mark.parametrize(
+    ("parts", "settings", "points"),
+    [
+        (lambda: {"smoke": smoke(rough_grid(1))[0]}, {}, True),
+        (lambda: {"smoke": smoke(np.repeat(rough_grid(1), 3, axis=-1), kind="own")[0]}, {}, True),
+        (lambda: {"smoke": smoke(rough_grid(1, 10.0))[0]}, {}, False),
+        (lambda: {"smoke": smoke(rough_grid(1))[0]}, {"shadows": "exact"}, False),
+        (lambda: {"smoke": smoke(rough_grid(1))[0]}, {"near_light": "vertices"}, False),
+        (lambda: {"smoke": smoke(rough_grid(1))[0], "fog": fog(0.2, to_world=BESIDE)[0]}, {}, False),
+        (lambda: {"smoke": fog(0.2)[0]}, {}, False),
+        (lambda: {"smoke": _two_grids()}, {}, False),
+    ],
+    ids=["thin", "rgb", "dense", "exact", "vertices", "two media", "homogeneous", "two grids"],
+)
+def test_where_points_take_the_place_of_cells(parts, settings, points):
+    """In a single medium with an albedo and a thin grid; then no coarse grid is made. Shadows of derivatives are looked up."""
+    scene = close_up({**parts(), "lamp": point([0.2, 0, 0])[0]}, res=8)
+    survey, settings = survey_scene(scene), Settings(max_depth=4, **settings)
+    needs = find_needs(scene, scene.sensors()[0], survey)
+    made = make_plan(needs, settings)
+    assert made.draws_points == points
+    with dr.suspend_grad():
+        built = [build_estimators(scene, needs, made, settings, survey, for_images=on) for on in (True, False)]
+    for estimators in built:
+        assert estimators.near is None or estimators.near.draws_points == points
+    (part, *_) = built[0].media.bodies[0].view.parts
+    assert part.lattice is None or (part.rough is None) == (points or built[0].near is None)
+    assert [estimators.direct.looks_up for estimators in built] == [False, settings.shadows != "exact"]
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_grey_variant_looks_up_grey_grids_only(each_variant, channels):
+    """It averages an rgb extinction, and the transmittance of the mean is not the mean transmittance."""
+    values = np.repeat(rough_grid(1), channels, axis=-1)
+    scene = close_up({"smoke": smoke(values, kind="own")[0], "lamp": point([0.2, 0, 0])[0]}, res=8)
+    needs = find_needs(scene, scene.sensors()[0], survey_scene(scene))
+    assert make_plan(needs, Settings(max_depth=4)).draws_points == (channels == 1 or each_variant.endswith("rgb"))

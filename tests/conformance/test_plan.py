@@ -199,6 +199,7 @@ def test_a_grid_has_what_the_plan_asks_for(skips: bool, tracks: bool, depth: int
     assert (part.lattice.empty_distances is not None) == skips
     assert (part.lattice.block_ranges is not None) == (tracks or depth == 4)
     assert (part.rough is not None) == (near and not points)
+    assert plan.are_thin == (True,)
     assert (None if part.largest is None else part.largest[0]) == (1 if depth == 4 else None)
     assert media.bodies[0].estimates_shadows == tracks
     assert not media.has_surfaces

@@ -299,8 +299,8 @@ class Absorption:
 
 
 class AbsorptionToLamps(Absorption):
-    """The same for the light of lamps seen directly: media are walked only in front of a lamp, and of a surface that may let the
-    light of a lamp behind it pass. Other rays carry no light, and have a transmittance of 1.
+    """The same for the light of lamps seen directly: rays walk the media in front of a lamp, or of a surface through which a
+    lamp may shine. Other rays carry no light, and have a transmittance of 1.
 
     Cost: one walk of each medium, in packets of rays that see a lamp.
     """
