@@ -48,6 +48,7 @@ __all__ = [
     "draws_points",
     "is_scattering_visible",
     "is_thin",
+    "looks_up",
     "shares_cells",
 ]
 
@@ -341,9 +342,14 @@ def is_thin(medium: MediumFacts) -> bool:
 
 def draws_points(needs: Needs, settings: Settings) -> bool:
     """Whether near light is drawn at points found by look-ups: in a single medium with an albedo and a thin grid."""
-    if settings.shadows == "exact" or len(needs.media) != 1 or not is_thin(needs.media[0]):
+    if not looks_up(needs, settings) or len(needs.media) != 1 or not is_thin(needs.media[0]):
         return False
     return all(_is_looked_up(view) for view in needs.views)
+
+
+def looks_up(needs: Needs, settings: Settings) -> bool:
+    """Whether few look-ups may estimate the light that thin grids let pass, where shadow rays lead to emitters."""
+    return settings.shadows != "exact" and any(kind != "uniform" for kind in needs.emitter_kinds)
 
 
 def _is_looked_up(view: MediumView) -> bool:

@@ -47,6 +47,7 @@ from mivol.scene.choices import (
     is_dense,
     is_scattering_visible,
     is_thin,
+    looks_up,
     tracks_flights,
 )
 from mivol.scene.media_light import find_emitting_boxes
@@ -116,7 +117,6 @@ class Plan:
         trims: whether only those before the first and behind the last occupied block of a ray are skipped.
         estimates_shadows: whether shadows of each medium are estimated in images.
         tracks_flights: whether delta tracking draws flights through the grids of each medium.
-        are_thin: whether look-ups at points take fewer steps than walks through the grids of each medium.
         segment: name of the segment estimator in :data:`mivol.transport.path.estimators.SEGMENT_ESTIMATORS`.
         scattering_points: scattering points per camera ray in images.
         pass_rays: most rays of a pass.
@@ -129,6 +129,7 @@ class Plan:
         draws_near_light: whether segments of paths draw the light of emitters with a position, in images.
         near_light_in_derivatives: the same, in derivatives.
         draws_points: whether they draw it at points found by look-ups, in place of coarse cells.
+        looks_up: whether few look-ups may estimate transmittances of thin grids: of near light, and of shadows in derivatives.
         near_emitters: numbers of the emitters inside of media.
         are_thick: whether collisions alone find the derivatives of each medium's extinction.
         have_low_albedo: whether some albedo of each medium may be too low for derivatives to be found at collisions.
@@ -146,7 +147,6 @@ class Plan:
     trims: tuple[bool, ...]
     estimates_shadows: tuple[bool, ...]
     tracks_flights: tuple[bool, ...]
-    are_thin: tuple[bool, ...]
     segment: str
     scattering_points: int
     pass_rays: int
@@ -159,6 +159,7 @@ class Plan:
     draws_near_light: bool
     near_light_in_derivatives: bool
     draws_points: bool
+    looks_up: bool
     near_emitters: tuple[int, ...]
     are_thick: tuple[bool, ...]
     have_low_albedo: tuple[bool, ...]
@@ -187,9 +188,8 @@ class Plan:
     def readings(self, for_images: bool) -> tuple:
         """All that decides what is read of the values of media (:func:`read_parts`)."""
         near = self.draws_near_light if for_images else self.near_light_in_derivatives
-        looks_up = tuple(self.segment == "free_flight" and thin for thin in self.are_thin)
         coarsens = near and not self.draws_points
-        return self.skips_empty, self.trims, self.estimates_shadows, self.tracks_flights, looks_up, coarsens
+        return self.skips_empty, self.trims, self.estimates_shadows, self.tracks_flights, self.looks_up, coarsens
 
 
 def find_skipping(occupied: float, is_sparse: bool) -> tuple[bool, bool]:
@@ -304,7 +304,6 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         trims,
         tracks,
         tuple(segment == "free_flight" and tracks_flights(m) for m in needs.media),
-        tuple(is_thin(m) for m in needs.media),
         segment,
         events,
         pass_rays,
@@ -317,6 +316,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
         near,
         near_in_derivatives,
         (near or near_in_derivatives) and draws_points(needs, settings),
+        segment == "free_flight" and looks_up(needs, settings),
         tuple(k for k, distance in enumerate(needs.emitter_distances) if distance == 0),
         tuple(_is_thick(m) for m in needs.media),
         tuple(_is_dark(m) for m in needs.media),
@@ -411,10 +411,10 @@ Readings = list[list[PartReading]]
 def read_parts(needs: Needs, plan: Plan, survey: SceneSurvey, for_images: bool) -> Readings:
     """Read the values that the planned estimators need besides the values themselves."""
     skips_empty, trims, estimates_shadows, tracks_flights, looks_up, coarsens = plan.readings(for_images)
-    media = zip(needs.boundaries, needs.views, skips_empty, trims, estimates_shadows, tracks_flights, looks_up, strict=True)
+    media = zip(needs.boundaries, needs.views, skips_empty, trims, estimates_shadows, tracks_flights, strict=True)
     return [
-        [read_part(p, survey, boundary.name, skip, trim, estimates or tracks, looks, coarsens) for p in view.parts]
-        for boundary, view, skip, trim, estimates, tracks, looks in media
+        [read_part(p, survey, boundary.name, skip, trim, estimates or tracks, looks_up, coarsens) for p in view.parts]
+        for boundary, view, skip, trim, estimates, tracks in media
     ]
 
 
@@ -461,7 +461,7 @@ def build_estimators(
         media = media.by_quadrature()
     # Candidates would lengthen gradients by a tenth.
     direct = DirectLighting(media, emitters, resamples=for_images, bright=bright if for_images else None)
-    direct.looks_up = not for_images and plan.segment == "free_flight" and settings.shadows != "exact"
+    direct.looks_up = plan.looks_up and not for_images
     choice = SegmentInputs(direct, plan.scattering_points)
     if plan.segment in ("single_scattering", "scattering_quadrature"):
         with dr.suspend_grad():
@@ -489,7 +489,7 @@ def build_estimators(
     near = None
     if draws_near_light:
         inside = [scene.emitters()[number] for number in plan.near_emitters]
-        near = NearLighting(direct, 0.0 if for_images else PROBE_DEPTH, inside, settings.shadows != "exact", plan.draws_points)
+        near = NearLighting(direct, 0.0 if for_images else PROBE_DEPTH, inside, plan.looks_up, plan.draws_points)
     mirrored = None
     if for_images and plan.keeps_mirrors:
         with dr.suspend_grad():

@@ -142,7 +142,8 @@ def check_near_light(needs: Needs, settings: Settings, segment: str) -> None:
 
 
 def check_bounded(needs: Needs, settings: Settings) -> None:
-    """Refuse rgb collisions in a field known at points, and derivatives by emitters whose shadows may jump with its values."""
+    """Refuse derivatives by emitters whose shadows may jump with the values of a field known at points, and, beside light of
+    Gaussians and in a grey variant, rgb collisions with such a field."""
     medium = next((m for m in needs.media if m.bounded), None)
     if medium is None:
         return
@@ -151,12 +152,12 @@ def check_bounded(needs: Needs, settings: Settings) -> None:
     parts = [(facts.name, part) for facts, view in zip(needs.media, needs.views, strict=True) for part in view.parts]
     bounded = [(name, part) for name, part in parts if not part.exact_line]
     rgb = [name for name, part in bounded if part.channels == 3] if collides and not settings.deterministic else []
+    field, grey = f"the bounded field of {', '.join(rgb)} is rgb", "make it grey (a plugin's channel_count(): 1)"
     reasons = [
-        (
-            bool(rgb),
-            f"a medium scatters or emits, and the bounded field of {', '.join(rgb)} is rgb",
-            "make it grey (a plugin's channel_count(): 1)",
-        ),
+        # A grey variant averages the channels; the transmittance of the mean is not the mean transmittance.
+        (bool(rgb) and mi.is_monochromatic, f"a medium scatters or emits, and {field} in a grey variant", grey),
+        # Their light is summed along a flight, which knows the densities of channels at its end only.
+        (bool(rgb) and any(v.shows_gaussians for v in needs.views), f"a medium of Gaussians shines, and {field}", grey),
         (
             bool(moved) and any(part.field.may_jump for _, part in bounded),
             f"the derivative of {', '.join(moved)} was requested, which misses jumps of its values",

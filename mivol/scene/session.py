@@ -69,6 +69,7 @@ from mivol.transport.estimators.lighting.emitters import read_emitters
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.line_integrals.aovs import integrate_aovs
 from mivol.transport.media.medium_view import MediumView
+from mivol.transport.media.stock_grids import StockGrids
 from mivol.transport.path.estimators import Settings
 from mivol.transport.path.film import find_batch_views
 from mivol.transport.path.walk import walk_path
@@ -106,8 +107,15 @@ class _SurveyedScene:
     def derives_from(self, scene: mi.Scene, differentiated: Sequence[tuple[str, mi.Object]]) -> bool:
         """Whether plugins compute values from differentiated parameters (keys and owners) of the scene."""
         if self.sources is None:
-            self.sources = {node.ptr for owner in _find_derived_owners(scene) for node in traverse(owner).hierarchy}
+            owners = _find_derived_owners(scene, self.find_grids())
+            self.sources = {node.ptr for owner in owners for node in traverse(owner).hierarchy}
         return any(owner.ptr in self.sources for _, owner in differentiated)
+
+    def find_grids(self) -> StockGrids:
+        """What is known of the stock grids of the scene, with their look-ups."""
+        for boundary in self.survey.boundaries:
+            boundary.view(self.survey.grids)
+        return self.survey.grids
 
     def is_of(self, parts: list[mi.Object]) -> bool:
         """Whether ``parts`` are the very same shapes and emitters."""
@@ -183,10 +191,13 @@ class Session:
     def render_forward(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int) -> mi.TensorXf:
         """Render the derivative of an image along the gradients set on the parameters."""
         sensor = _find_renderable_sensor(scene, sensor)
-        with without_garbage_collection(), carry_tangents(scene):
+        with without_garbage_collection():
             with dr.resume_grad():
-                opened = self._open(scene, sensor, spp, self._read_state(scene, sensor, False), for_images=False)
-            return self._run(TangentTask, opened, scene, sensor, _opaque_seed(seed))
+                grids = self._survey(scene, self._read_state(scene, sensor, False)).find_grids()
+            with carry_tangents(scene, grids):
+                with dr.resume_grad():
+                    opened = self._open(scene, sensor, spp, self._read_state(scene, sensor, False), for_images=False)
+                return self._run(TangentTask, opened, scene, sensor, _opaque_seed(seed))
 
     def render_backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: int | mi.Sensor, seed: int, spp: int) -> None:
         """Add the derivatives of an image, weighted by ``grad_in``, to the gradients of the parameters.
@@ -199,7 +210,7 @@ class Session:
                 attached: list[Any] = []
                 state = self._read_state(scene, sensor, False, attached)
                 if self._survey(scene, state).derives_from(scene, state.differentiated):
-                    recompute_derived(scene)
+                    recompute_derived(scene, self._surveyed.survey.grids)
                     attached = []
                     state = self._read_state(scene, sensor, False, attached)
                 opened = self._open(scene, sensor, spp, state, for_images=False)
@@ -518,18 +529,18 @@ class _DifferentiatedParameter:
         put_value(self.params, self.key, self.value)
 
 
-def recompute_derived(scene: mi.Scene) -> None:
+def recompute_derived(scene: mi.Scene, grids: StockGrids) -> None:
     """Recompute the derived values of all parameters with gradients. Does nothing while ``dr.freeze`` records."""
-    for parameter in _find_differentiated(scene):
+    for parameter in _find_differentiated(scene, grids):
         parameter.assign(parameter.value)
         parameter.restore()
 
 
 @contextmanager
-def carry_tangents(scene: mi.Scene) -> Iterator[None]:
+def carry_tangents(scene: mi.Scene, grids: StockGrids) -> Iterator[None]:
     """Compute derived values from copies of the parameters, with tangents, inside a ``with`` block."""
     with dr.resume_grad():
-        parameters = _find_differentiated(scene)
+        parameters = _find_differentiated(scene, grids)
         copies = [dr.detach(parameter.numbers) for parameter in parameters]
         for parameter, copy in zip(parameters, copies, strict=True):
             dr.enable_grad(copy)
@@ -547,30 +558,31 @@ def carry_tangents(scene: mi.Scene) -> Iterator[None]:
                 parameter.restore()
 
 
-def _find_differentiated(scene: mi.Scene) -> list[_DifferentiatedParameter]:
+def _find_differentiated(scene: mi.Scene, grids: StockGrids) -> list[_DifferentiatedParameter]:
     """Find the parameters with gradients of emitters, BSDFs, phase functions and volumes."""
     if is_recording():
         return []
     parameters = []
-    for owner in _find_derived_owners(scene):
+    for owner in _find_derived_owners(scene, grids):
         params = traverse(owner)
         followed = [(k, v) for k, v in list_values(params) if find_gradient_array(v) is not None]
         parameters += [_DifferentiatedParameter(params, k, type(v)(v)) for k, v in followed if not _is_computed(params, k)]
     return parameters
 
 
-def _find_derived_owners(scene: mi.Scene) -> list[mi.Object]:
+def _find_derived_owners(scene: mi.Scene, grids: StockGrids) -> list[mi.Object]:
     """The emitters, BSDFs, phase functions and volumes that may compute values from their parameters."""
     inside = [shape.interior_medium() for shape in scene.shapes() if shape.interior_medium() is not None]
-    owners = [*scene.emitters(), *(s.bsdf() for s in scene.shapes()), *(o for m in inside for o in _find_parts(m))]
+    owners = [*scene.emitters(), *(s.bsdf() for s in scene.shapes()), *(o for m in inside for o in _find_parts(m, grids))]
     return list({o.ptr: o for o in owners if o is not None}.values())
 
 
-def _find_parts(medium: mi.Medium) -> list[mi.Object]:
+def _find_parts(medium: mi.Medium, grids: StockGrids) -> list[mi.Object]:
     """The phase function of a medium, and its volumes except those read directly by transport."""
     known = traverse_children(medium).properties
     volumes = {key.partition(".")[0]: node for key, (_, _, node, _) in known.items() if isinstance(node, mi.Volume)}
-    stands = [n for n, v in volumes.items() if n.startswith("sigma_") or hasattr(v, "mivol_extinction")]
+    fields = {n for n, v in volumes.items() if hasattr(v, "mivol_extinction")}
+    stands = [n for n, v in volumes.items() if n in fields or (n.startswith("sigma_") and not grids.is_called(v))]
     read = [n for n in stands if not any(f"{n}.{source}" in known for source in SOURCES)]
     return [medium.phase_function(), *(v for n, v in volumes.items() if n not in read)]
 

@@ -174,17 +174,19 @@ def test_facts_with_the_same_key_have_the_same_decisions(monkeypatch: pytest.Mon
 
 
 CASES = [
-    (False, False, 2, False, False),
-    (True, False, 2, False, False),
-    (False, True, 2, False, False),
-    (False, False, 4, False, False),
-    (False, False, 4, True, False),
-    (False, False, 4, True, True),
+    (False, False, 2, False, False, False),
+    (True, False, 2, False, False, False),
+    (False, True, 2, False, False, False),
+    (False, False, 4, False, False, False),
+    (False, False, 4, True, False, False),
+    (False, False, 4, True, True, True),
 ]
 
 
-@pytest.mark.parametrize(("skips", "tracks", "depth", "near", "points"), CASES)
-def test_a_grid_has_what_the_plan_asks_for(skips: bool, tracks: bool, depth: int, near: bool, points: bool) -> None:
+@pytest.mark.parametrize(("skips", "tracks", "depth", "near", "points", "looks"), CASES)
+def test_a_grid_has_what_the_plan_asks_for(
+    skips: bool, tracks: bool, depth: int, near: bool, points: bool, looks: bool
+) -> None:
     """Nothing is read from the grid that no estimator will ask for."""
     values = np.zeros((8, 8, 8, 1), np.float32)
     values[2:4, 2:4, 2:4] = 1
@@ -193,14 +195,14 @@ def test_a_grid_has_what_the_plan_asks_for(skips: bool, tracks: bool, depth: int
     needs = find_needs(scene, scene.sensors()[0], survey)
     plan = make_plan(needs, settings)
     assert (plan.segment == "free_flight") == (depth == 4)
-    plan = replace(plan, skips_empty=(skips,), estimates_shadows=(tracks,), draws_near_light=near, draws_points=points)
+    asked = {"draws_near_light": near, "draws_points": points, "looks_up": looks}
+    plan = replace(plan, skips_empty=(skips,), estimates_shadows=(tracks,), **asked)
     media = build_media(scene, needs, plan, survey)
     ((part,),) = [body.view.parts for body in media.bodies]
     assert (part.lattice.empty_distances is not None) == skips
     assert (part.lattice.block_ranges is not None) == (tracks or depth == 4)
     assert (part.rough is not None) == (near and not points)
-    assert plan.are_thin == (True,)
-    assert (None if part.largest is None else part.largest[0]) == (1 if depth == 4 else None)
+    assert (None if part.largest is None else part.largest[0]) == (1 if looks else None)
     assert media.bodies[0].estimates_shadows == tracks
     assert not media.has_surfaces
 

@@ -776,8 +776,8 @@ def test_a_replay_launches_few_kernels() -> None:
     def step() -> None:
         pair.scale(key, 0.99), pair.gradient(pair.recorded, key, 2)
 
-    # A changed grid is read again: its update, one kernel for the extremes of its blocks, their table, and the largest value.
-    assert count_launches(step) <= 90
+    # A changed grid is read again: its update, one kernel for the extremes of its blocks, and their table.
+    assert count_launches(step) <= 89
 
 
 def test_a_changed_grid_is_read_without_tracing(monkeypatch: pytest.MonkeyPatch) -> None:

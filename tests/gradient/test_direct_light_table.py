@@ -91,7 +91,7 @@ def find_baseline(monkeypatch: pytest.MonkeyPatch, g: float = 0.0, **emitters: d
     dr.enable_grad(params[key])
     params.update()
     weights = dr.full(mi.TensorXf, 1.0, (32, 32, 3))
-    mi.load_dict(mivol(max_depth=3)).render_backward(scene, params, weights, seed=1, spp=32)
+    mi.load_dict(mivol(max_depth=3, shadows="exact")).render_backward(scene, params, weights, seed=1, spp=32)
     return found[0]
 
 

@@ -60,6 +60,11 @@ class StockGrids:
             self.trilinear[volume.ptr] = answer
         return self.trilinear.get(volume.ptr, True)
 
+    def is_called(self, volume: mi.Volume) -> bool:
+        """Whether transport calls a volume at points, as far as its look-ups are known; it reads the values of others."""
+        is_read = volume.class_name() in ("GridVolume", "ConstVolume") or hasattr(volume, "mivol_to_world")
+        return not is_read or not self.trilinear.get(volume.ptr, True)
+
 
 def compare_look_up(volume: mi.Volume, lattice: Lattice) -> bool | None:
     """Compare values of a stock grid with trilinear values, since Mitsuba exposes neither filter nor borders.

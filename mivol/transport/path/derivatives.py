@@ -179,7 +179,8 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
     stem_score = Replay(branching.add_light(stem_light, L), dL)
     listed = None
     if n >= MIN_LISTED and any(body.needs_probes for body in estimators.media.bodies):
-        listed = _ProbeList.empty(n, estimators.media.has_surfaces)
+        baseline = estimators.segment.baseline
+        listed = _ProbeList.empty(n, estimators.media.has_surfaces, baseline is not None and baseline.depends_on_starts)
 
     def replay(is_stem: mi.Bool) -> None:
         begun, score = dr.select(is_stem, (start.clone(), stem_score), (branches.clone(), branch_score))
@@ -434,6 +435,7 @@ class _ProbeList:
 
     Attributes:
         p: the points.
+        t: distances from the starts of their flights [length], if the baseline depends on these starts; else None.
         d: directions of their flights.
         time: times of their rays.
         body: indices of their media.
@@ -445,6 +447,7 @@ class _ProbeList:
     """
 
     p: mi.Point3d
+    t: mi.Float64 | None
     d: mi.Vector3f
     time: mi.Float
     body: mi.UInt32
@@ -455,12 +458,13 @@ class _ProbeList:
     counts: list[mi.UInt32]
 
     @classmethod
-    def empty(cls, stems: int, has_surfaces: bool) -> _ProbeList:
+    def empty(cls, stems: int, has_surfaces: bool, keeps_starts: bool) -> _ProbeList:
         """A list with room for the probes of stems and branches, as many branches as stems."""
         # Only a stem that has scattered at a surface has a later probe too.
         n = stems * (3 if has_surfaces else 2)
-        kinds = mi.Point3d, mi.Vector3f, mi.Float, mi.UInt32, mi.Spectrum, mi.UInt32, mi.UInt32, mi.UInt32
-        made = cls(*(dr.empty(kind, n) for kind in kinds), [dr.opaque(mi.UInt32, 0) for _ in range(2)])
+        kinds = mi.Vector3f, mi.Float, mi.UInt32, mi.Spectrum, mi.UInt32, mi.UInt32, mi.UInt32
+        t = dr.empty(mi.Float64, n) if keeps_starts else None
+        made = cls(dr.empty(mi.Point3d, n), t, *(dr.empty(k, n) for k in kinds), [dr.opaque(mi.UInt32, 0) for _ in range(2)])
         dr.eval(made)
         return made
 
@@ -474,6 +478,8 @@ class _ProbeList:
         stored = self.p, self.d, self.time, self.body, self.gain, self.depth, self.bits, self.state
         for array, value in zip(stored, (*values, own.bits, own.state), strict=True):
             dr.scatter(array, value, place, on)
+        if self.t is not None:
+            dr.scatter(self.t, probe.t, place, on)
 
     def add_derivatives(self, estimators: Estimators, wavelengths: mi.Color0f) -> None:
         """Walk paths from the probes, and add the derivatives of the probes."""
@@ -486,8 +492,11 @@ class _ProbeList:
         nowhere, one, flight = dr.zeros(mi.MediumPtr, n), (mi.Spectrum(1), mi.Float(1)), KnownFlight(zero, self.body, every)
         start = PathStart(ray, nowhere, *one, self.depth, sampler, every, flight, every)
         L = walk_from_points(estimators.replayed(), start, front, back)
-        probe = Probe(ray, zero, self.body, self.gain, self.depth, dr.ones(mi.Float, n), dr.ones(mi.Float, n))
         mei = medium_interaction(ray, zero)
+        # With the baseline of another flight, the terms of flights and probes would not have the mean 0.
+        t = zero if self.t is None else self.t
+        flown = replace(ray, o=self.p - mi.Vector3d(self.d) * t)
+        probe = Probe(flown, t, self.body, self.gain, self.depth, dr.ones(mi.Float, n), dr.ones(mi.Float, n))
         mei.medium = media.medium_of(self.body, on)
         ProbeTerm(media, probe, mei, L, estimators.segment.baseline, on).vjp(mi.Spectrum(1))
 

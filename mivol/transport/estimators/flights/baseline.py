@@ -335,6 +335,11 @@ class Baseline:
         return lambda lower: self._read(blocks.at_node(lower), active)
 
     @property
+    def depends_on_starts(self) -> bool:
+        """Whether some baseline is that of the block in which a flight begins: where no grid tells blocks along the flight."""
+        return any(blocks.lattice is None for blocks in self.blocks)
+
+    @property
     def average(self) -> mi.Spectrum:
         """The mean over all collisions."""
         first = (mi.UInt32(c * self.repeats) for c in range(dr.size_v(mi.Spectrum)))

@@ -66,6 +66,7 @@ from mivol.transport.estimators.segment import (
 )
 from mivol.transport.media.body import Body, eval_albedo, medium_interaction
 from mivol.transport.media.extinction import (
+    BoundedExtinction,
     ExactExtinction,
     Extinction,
     RayInterval,
@@ -196,9 +197,9 @@ def _collide_in_grid(
 
 
 def _has_densities(part: Extinction) -> bool:
-    """Whether a flight through the part finds its density in each channel: in rgb grids."""
-    is_grid = isinstance(part, GridExtinction | ActivatedGridExtinction)
-    return is_grid and part.channels > 1 and not mi.is_monochromatic
+    """Whether a flight through the part finds its density in each channel: in rgb grids, and rgb fields known at points."""
+    finds = isinstance(part, GridExtinction | ActivatedGridExtinction | BoundedExtinction)
+    return finds and part.channels > 1 and not mi.is_monochromatic
 
 
 def sample_gaussian_flight(
@@ -427,7 +428,7 @@ def _weigh_channels(
     def exact(body: Body) -> list[ExactExtinction]:
         return [part for part in left(body) if part.exact_line]
 
-    # Grey and bounded parts have the same transmittance in each channel, and media of such parts alone the same density.
+    # Grey parts have the same transmittance in each channel, and media of such parts alone the same density.
     coloured = [body for body in media.bodies if any(part.channels > 1 for part in left(body))]
     if coloured:
         # Only ratios of transmittances matter; the largest becomes 1.
@@ -510,24 +511,25 @@ def _find_first_collision(
             if known is not None:
                 ahead.active &= ~known.on
             if not part.exact_line:
-                hit, rng = delta_tracking(part, scale, ahead, rng)
+                hit, found, rng = delta_tracking(part, scale, ahead, channel, rng)
             elif isinstance(part, GaussianExtinction):
                 hit, rng = sample_gaussian_flight(part, scale, ahead, rng)
+                found = []
             elif isinstance(part, OctreeExtinction):
                 hit = part.find_collision(scale, ahead, -dr.log(1 - u), channel)
                 rng, (other,) = draw_pcg32(rng, 1)
-                u = dr.select(ahead.active, other, u)
+                u, found = dr.select(ahead.active, other, u), []
             else:
                 if _tracks_grid(part) and not inverts:
                     hit, found, rng = delta_tracking_in_blocks(part, scale, ahead, channel, u, rng)
                 else:
                     hit, found = regular_tracking(part, scale, ahead, -dr.log(1 - u), channel)
-                if found:
-                    densities = scale_to_largest([d * f for d, f in zip(densities, found, strict=True)])
                 # The first flight takes the spread number of the segment. Each other part, and each further entry into a
                 # traced boundary, needs its own.
                 rng, (other,) = draw_pcg32(rng, 1)
                 u = dr.select(ahead.active, other, u)
+            if found:
+                densities = scale_to_largest([d * f for d, f in zip(densities, found, strict=True)])
             nearer = ahead.active & (hit < t)
             t, index = dr.select(nearer, hit, t), dr.select(nearer, mi.UInt32(number), index)
             has_density = dr.select(nearer, _has_densities(part), has_density)

@@ -322,8 +322,7 @@ def delta_tracking_in_blocks(
         row = [dr.gather(mi.Float, values, node * channels + c, stored) for c in range(channels)]
         real = meets & (u[3] * majorant <= select_channel(row, channel))
         if channels > 1:
-            found = [dr.select(real, value, majorant - value) for value in row]
-            densities = scale_to_largest([dr.select(meets, d * f, d) for d, f in zip(densities, found, strict=True)])
+            densities = _pass_tentative_collision(densities, row, majorant, real, meets)
         ahead = dr.select(meets, -dr.log(u[4]), dr.maximum(ahead - dr.select(on, rate * dt, 0), 0))
         return (ahead, dr.select(real, cell.s + dt, s), collides | real, densities, rng), dt
 
@@ -363,26 +362,40 @@ def delta_tracking(
     part: BoundedExtinction,
     scale: mi.Float,
     interval: RayInterval,
+    channel: mi.UInt32,
     rng: mi.UInt32,
-) -> tuple[mi.Float64, mi.UInt32]:
-    """Find the first collision with a grey bounded field; result as for :func:`delta_tracking_in_blocks`.
+) -> tuple[mi.Float64, list[mi.Float], mi.UInt32]:
+    """Find the first collision with a bounded field; arguments and results as for :func:`delta_tracking_in_blocks`.
 
-    Cost: int M dt look-ups in the field's box.
+    Cost: int M dt look-ups in the field's box, and kappa times as many in rgb fields.
     """
-    ray = interval.ray
+    ray, is_rgb = interval.ray, part.channels > 1
     begin, end = part.clip(interval)
-    rate = scale * part.majorant
+    rate = (LOOKUP_RATE if is_rgb else 1) * scale * part.majorant
 
-    def step(t: mi.Float, collides: mi.Bool, rng: mi.UInt32, on: mi.Bool) -> tuple:
+    def step(t: mi.Float, collides: mi.Bool, densities: list[mi.Float], rng: mi.UInt32, on: mi.Bool) -> tuple:
         rng, (u, chance) = draw_pcg32(rng, 2)
         # The next point is at infinity if the majorant is 0.
         t = t - dr.log(u) / rate
         on &= t < end
-        (value,) = part.eval_at(scale, ray, t, on)
-        real = on & (chance * rate <= value)
-        return t, collides | real, rng, on & ~real
+        row = part.eval_at(scale, ray, t, on)
+        real = on & (chance * rate <= select_channel(row, channel))
+        if is_rgb:
+            densities = _pass_tentative_collision(densities, row, rate, real, on)
+        return t, collides | real, densities, rng, on & ~real
 
-    none = dr.full(mi.Bool, False, dr.width(ray))
-    start = (mi.Float(begin), none, mi.UInt32(rng), interval.active & (end > begin))
-    t, collides, rng, _ = dr.while_loop(start, lambda t, collides, rng, on: on, step, label="collisions with a bounded medium")
-    return dr.select(collides, mi.Float64(t), dr.inf), rng
+    width = dr.width(ray)
+    ones = [dr.full(mi.Float, 1, width) for _ in range(part.channels if is_rgb else 0)]
+    start = (mi.Float(begin), dr.full(mi.Bool, False, width), ones, mi.UInt32(rng), interval.active & (end > begin))
+    t, collides, densities, rng, _ = dr.while_loop(
+        start, lambda *state: state[-1], step, label="collisions with a bounded medium"
+    )
+    return dr.select(collides, mi.Float64(t), dr.inf), densities, rng
+
+
+def _pass_tentative_collision(
+    densities: list[mi.Float], row: list[mi.Float], majorant: mi.Float, real: mi.Bool, meets: mi.Bool
+) -> list[mi.Float]:
+    """Multiply the density of each channel by that of a tentative collision and of what it is found to be: real, or not."""
+    found = [dr.select(real, value, majorant - value) for value in row]
+    return scale_to_largest([dr.select(meets, d * f, d) for d, f in zip(densities, found, strict=True)])
