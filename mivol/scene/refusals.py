@@ -142,8 +142,8 @@ def check_near_light(needs: Needs, settings: Settings, segment: str) -> None:
 
 
 def check_bounded(needs: Needs, settings: Settings) -> None:
-    """Refuse derivatives by emitters whose shadows may jump with the values of a field known at points, and, beside light of
-    Gaussians and in a grey variant, rgb collisions with such a field."""
+    """Refuse derivatives by emitters whose shadows may jump with the values of a field known at points, and rgb collisions with
+    such a field beside light of Gaussians."""
     medium = next((m for m in needs.media if m.bounded), None)
     if medium is None:
         return
@@ -154,8 +154,6 @@ def check_bounded(needs: Needs, settings: Settings) -> None:
     rgb = [name for name, part in bounded if part.channels == 3] if collides and not settings.deterministic else []
     field, grey = f"the bounded field of {', '.join(rgb)} is rgb", "make it grey (a plugin's channel_count(): 1)"
     reasons = [
-        # A grey variant averages the channels; the transmittance of the mean is not the mean transmittance.
-        (bool(rgb) and mi.is_monochromatic, f"a medium scatters or emits, and {field} in a grey variant", grey),
         # Their light is summed along a flight, which knows the densities of channels at its end only.
         (bool(rgb) and any(v.shows_gaussians for v in needs.views), f"a medium of Gaussians shines, and {field}", grey),
         (

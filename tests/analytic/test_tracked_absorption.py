@@ -11,9 +11,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from false_alarms import Estimate, assert_same_mean
+from gaussian_scenes import cloud, tensors_of
 
 from mivol.errors import MivolError
 from mivol.experiments.script import explain
+from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, HARMONICS
 from mivol.scene import plan
 
 SIDE, SPP, SKY, SCALE = 12, 256, 0.8, 1.2
@@ -245,18 +247,26 @@ def test_several_passes_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     check(tangent[..., 0], -SCALE * chord * SKY * np.exp(-1.5 * SCALE * chord), "the derivative by sigma")
 
 
-REFUSED = {
-    "rgb": ({"max_depth": 3}, {**fog([1.0, 0.5, 2.0]), "albedo": 0.5}, "the bounded field of fog is rgb: make it grey"),
-    "emission": ({"max_depth": 1}, {**fog([1.0, 0.5, 2.0]), "emission": 0.5}, "the bounded field of fog is rgb: make it grey"),
-}
+@pytest.mark.statistical
+@pytest.mark.parametrize("more", [{"albedo": 0.5}, {"albedo": 0.6, "emission": 0.3}], ids=["scattering", "glowing"])
+def test_each_channel_of_a_coloured_ball_is_a_grey_ball(more: dict) -> None:
+    """Images, and derivatives by the extinction of a channel, of light that scatters up to three times."""
+    sigma = [0.2, 0.8, 2.0]
+    found = scene([0, -4, 0.4], [0, 0, 0.2], fog=shape("cube", {**fog(sigma, radius=0.8), **more}))
+    ours = follow(found, ("sigma_t.sigma",), 4)
+    for channel, value in enumerate(sigma):
+        truth = follow(scene([0, -4, 0.4], [0, 0, 0.2], fog=shape("cube", {**fog(value, radius=0.8), **more})), ("sigma",), 4)
+        for a, b, what in zip(ours[:2], truth[:2], ("the radiance", "the derivative"), strict=True):
+            assert_same_mean(of_batches(a[..., channel]), of_batches(b[..., channel]), what=f"{what} of channel {channel}")
 
 
-@pytest.mark.parametrize("asked", REFUSED)
-def test_colours_that_collide_are_refused_by_name(asked: str) -> None:
-    settings, medium, sentence = REFUSED[asked]
-    found = scene([0, -4, 0], [0, 0, 0], fog=shape("cube", {**fog(), **medium}))
+def test_colours_that_collide_beside_shining_gaussians_are_refused() -> None:
+    light = {"type": "mivol_medium", "emission": tensors_of(cloud(3), (*EXTINCTION_PARAMETERS, HARMONICS))}
+    fire = shape("cube", light, to_world=mi.ScalarTransform4f().translate([5, 0, 0]))
+    found = scene([0, -4, 0], [0, 0, 0], fog=shape("cube", {**fog([1.0, 0.5, 2.0]), "albedo": 0.5}), fire=fire)
+    sentence = "a medium of Gaussians shines, and the bounded field of fog is rgb: make it grey"
     with pytest.raises(MivolError, match=f"the medium in fog is a Ball, which is known at points only, .*{sentence}"):
-        mi.render(found, integrator=mi.load_dict({"type": "mivol", **settings}), spp=1)
+        mi.render(found, integrator=mi.load_dict({"type": "mivol", "max_depth": 3}), spp=1)
 
 
 def test_light_that_cannot_be_drawn_is_refused() -> None:

@@ -442,31 +442,50 @@ def test_lanes_that_are_off_and_vacuum_have_no_collision():
     assert np.isinf(np.array(fly(empty, ray_interval(), 4))).all()
 
 
-def ball(slack: float, sigma: float = 0.6) -> BoundedExtinction:
+def ball(slack: float, sigma: float | list[float] = 0.6) -> BoundedExtinction:
     """A ball of radius 1 about the point of the ray at 2.5."""
-    field = Ball(mi.Float(sigma), 1.0, tuple(START + 2.5 * D))
-    return BoundedExtinction("sigma_t", field, mi.Float(SCALE), mi.Float(sigma * slack))
+    field = Ball(mi.Color3f(sigma) if isinstance(sigma, list) else mi.Float(sigma), 1.0, tuple(START + 2.5 * D))
+    return BoundedExtinction("sigma_t", field, mi.Float(SCALE), mi.Float(float(np.max(sigma)) * slack))
+
+
+def fly_in_ball(part: BoundedExtinction, interval: RayInterval, seed: int) -> mi.Float64:
+    return delta_tracking(part, mi.Float(SCALE), interval, mi.UInt32(0), lane_generators(seed))[0]
 
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("slack", [1.0, 3.0])
 def test_flights_through_a_ball(slack):
     """Collisions between 1.5 and 3.5, for any majorant."""
-    t, after = delta_tracking(ball(slack), mi.Float(SCALE), ray_interval(), lane_generators(5))
+    t, densities, after = delta_tracking(ball(slack), mi.Float(SCALE), ray_interval(), mi.UInt32(0), lane_generators(5))
     tau = 0.6 * SCALE * np.clip(np.array(t) - 1.5, 0, 2)
     assert_flights(t, tau, np.exp(-2 * 0.6 * SCALE))
-    assert dr.width(after) == N
+    assert dr.width(after) == N and densities == []
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("slack", [1.0, 3.0])
+def test_densities_of_flights_through_a_coloured_ball(slack: float) -> None:
+    """As for grids: 1 - exp(-tau) of what a channel's flights have passed has the mean of its square over 2."""
+    sigma, channel = [0.6, 0.1, 1.5], dr.arange(mi.UInt32, N) % 3
+    t, densities, _ = delta_tracking(ball(slack, sigma), mi.Float(SCALE), ray_interval(), channel, lane_generators(8))
+    density, met = np.array(densities, np.float64), np.isfinite(np.array(t))
+    assert density.max() <= 1 + 1e-6 and np.all(density.max(axis=0) > 0.999)
+    weights, passed = density / density.mean(axis=0), np.where(met, np.clip(np.array(t) - 1.5, 0, 2), 0)
+    for w, value in zip(weights, sigma, strict=True):
+        opacity, reached = -np.expm1(-2 * SCALE * value), -np.expm1(-SCALE * value * passed)
+        for found, mean in ((w, 1.0), (w * met, opacity), (w * reached * met, opacity**2 / 2)):
+            assert_same_mean(Moments.from_values(found), mean, rounding=3e-5, what=f"extinction {value}")
 
 
 @pytest.mark.statistical
 def test_flights_that_begin_and_end_in_the_ball():
-    t, _ = delta_tracking(ball(2.0), mi.Float(SCALE), ray_interval(2.0, 3.0), lane_generators(6))
+    t = fly_in_ball(ball(2.0), ray_interval(2.0, 3.0), 6)
     assert_flights(t, 0.6 * SCALE * (np.array(t) - 2.0), np.exp(-0.6 * SCALE))
 
 
 def test_lanes_that_are_off_and_balls_of_nothing_have_no_collision():
-    assert np.isinf(np.array(delta_tracking(ball(1.0), mi.Float(SCALE), ray_interval(on=False), lane_generators(7))[0])).all()
-    assert np.isinf(np.array(delta_tracking(ball(0.0), mi.Float(SCALE), ray_interval(), lane_generators(7))[0])).all()
+    assert np.isinf(np.array(fly_in_ball(ball(1.0), ray_interval(on=False), 7))).all()
+    assert np.isinf(np.array(fly_in_ball(ball(0.0), ray_interval(), 7))).all()
 
 
 LANES, BALL_SIGMA, BALL_SCALE = 1 << 16, 0.125, 1.2

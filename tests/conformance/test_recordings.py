@@ -400,6 +400,30 @@ def test_values_that_plugins_compute_are_known_by_their_sources(key: str, comput
     assert surveyed.derives_from(scene, state.differentiated) is computes
 
 
+def test_arrays_of_a_coloured_grid_that_is_called_follow_its_values() -> None:
+    """Mitsuba pads colours to four numbers, in an array of its own. Between two updates, each tangent counts, and a gradient
+    finds the values after it."""
+    values = np.random.default_rng(3).uniform(0, 2, (4, 4, 4, 3)).astype(np.float32)
+    grid = grid_volume("gridvolume", values, PLACE) | {"filter_type": "nearest", "raw": True}
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.5]).scale(3)}
+    scene = close_up({"smoke": box_of(medium("heterogeneous", grid, 0.7), PLACE), "floor": floor, "sky": sky(0.7)}, res=6)
+    params, key, integrator = mi.traverse(scene), INSIDE + "sigma_t.data", mi.load_dict(mivol(max_depth=3))
+    value = mi.TensorXf(values)
+    dr.enable_grad(value)
+    params[key] = value
+    params.update()
+    tangents = []
+    for factor in (1, -2):
+        dr.set_grad(value, factor * mi.TensorXf(values))
+        tangents.append(np.array(integrator.render_forward(scene, params, seed=1, spp=4)))
+    np.testing.assert_array_equal(tangents[1], -2 * tangents[0])
+    dr.set_grad(value, 0)
+    dr.backward(dr.sum(mi.render(scene, params, integrator=integrator, seed=2, seed_grad=1, spp=4)))
+    # The same paths; some 1000 float32 terms of both signs.
+    assert np.sum(np.array(dr.grad(value)) * values) == pytest.approx(np.sum(tangents[0], dtype=np.float64), rel=1e-3)
+
+
+
 def test_what_a_recording_does_not_follow_is_recorded_anew() -> None:
     """A refractive index is a number in the kernels of Mitsuba's glass."""
     pair = Pair(smoke_under(sky=sky(0.7), pane={"type": "rectangle", "bsdf": {"type": "thindielectric"}}), 3)

@@ -167,6 +167,19 @@ def test_listed_probes_add_what_probes_add_in_their_lanes(name: str, monkeypatch
     np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-5 * np.abs(found[1]).max())
 
 
+def test_listed_probes_have_the_baseline_of_their_flights(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a box without a grid it is that of the block in which a flight begins, here another number in each block."""
+    monkeypatch.setattr(Baseline, "_read", lambda self, block, active: mi.Spectrum(0.1 * mi.Float(block % 5)))
+    monkeypatch.setattr(SceneMedia, "find_only_constant", lambda self: None)
+    smoke, found = box_of(medium("homogeneous", 0.3, 0.8), PLACE), []
+    for fewest in (1, 1 << 30):
+        monkeypatch.setattr(derivatives, "MIN_LISTED", fewest)
+        scene, integrator = close_up({"smoke": smoke, "lit": sky(0.3)}, res=8), mi.load_dict(mivol(max_depth=5))
+        found.append(backward(scene, MEDIUM + "sigma_t.value.value", np.ones((8, 8, 3)), 64, fresh(3), integrator))
+    # 4096 float32 terms of both signs.
+    np.testing.assert_allclose(*found, rtol=1e-4)
+
+
 def lit_inside(lamp: dict, rgb: bool = False) -> mi.Scene:
     """A lamp inside of smoke: segments draw its light."""
     values = 0.5 + rough_grid(4, 3.0)
