@@ -26,9 +26,10 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
         deterministic: scattered light by quadrature along the ray, without noise; at depth 2, for point, spot and directional
             lights. Derivatives are still sampled. The quadrature has a small error (docs/limits.md). Volumes known at points
             (``mivol_hash``) are integrated without noise too. Default false.
-        shadows: exact; estimated: unbiased, from a few look-ups, in images (gradients walk every cell); grid: with
-            ``deterministic``, looked up in a lattice of optical depths; auto: exact, or estimated for fine grids, and in images
-            of media that scatter several times one exact shadow ray a path, chosen without bias by a table. Default auto.
+        shadows: exact; estimated: unbiased, from a few look-ups, in images (gradients walk every cell of dense grids); grid:
+            with ``deterministic``, looked up in a lattice of optical depths; auto: exact, or estimated for fine grids and in
+            gradients by thin grids, and in images of media that scatter several times one exact shadow ray a path, chosen
+            without bias by a table. Default auto.
         media_light: how light emitted by media finds scattering points. drawn: points in media are sampled, besides chance
             hits; met: by chance hits only; auto: the method with the smaller error in a small preview. Default auto.
         near_light: where emitters with a position (point, spot, area) light media that scatter several times. segments: every

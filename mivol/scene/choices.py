@@ -10,6 +10,7 @@ import mitsuba as mi
 from mivol.files.volume import VOXELS
 from mivol.scene.needs import MediumFacts, Needs
 from mivol.scene.survey import OwnRaysNoise
+from mivol.transport.estimators.lighting.shadow_rays import FACES_ON_EDGE, LOOKUPS, STEPS_PER_LOOKUP
 from mivol.transport.media.body import flight_parts
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.path.estimators import Settings
@@ -133,6 +134,9 @@ MAX_THIN_CELL = 0.85
 """Bound of the optical depth along the edge of a cell [1] up to which look-ups at random points take fewer steps than a walk of
 cells. (Time of a gradient, by flights through rgb grids over that of inverted optical depths: 0.7 to 0.8 with 0.25, 1.06 with
 1.6. By near light at points over that in coarse cells: 0.78 to 0.9 with 0.15, 1.0 with 1.7.)"""
+
+MAX_LOOKED_UP_CELL = FACES_ON_EDGE / (STEPS_PER_LOOKUP * LOOKUPS)
+"""The same bound for shadow rays in gradients."""
 
 MIN_FILLED_SHARE = 0.25
 """Share of occupied blocks above which a grid counts as filled."""
@@ -376,11 +380,13 @@ def choose_shadows(medium: MediumFacts, needs: Needs, settings: Settings) -> Cho
     if settings.shadows != "auto":
         return Choice(subject, settings.shadows, "set by the user")
     size = f"{cells:.0f} occupied cells along the three axes"
+    looked_up = settings.scatterings > 1 and looks_up(needs, settings) and (medium.cell_depth or 1.0) < MAX_LOOKED_UP_CELL
+    gradients = "gradients take a few look-ups" if looked_up else "gradients walk every cell"
     if cells < MIN_ESTIMATED_CELLS:
-        return Choice(subject, "exact", f"{size}: a walk is cheap")
+        return Choice(subject, "exact", f"{size}: a walk is cheap" + (f"; {gradients}" if looked_up else ""))
     if set(needs.emitter_kinds) == {"delta"}:
         return Choice(subject, "exact", "no emitter is extended: estimates are coarse where all light is faint")
-    return Choice(subject, "estimated", f"{size}: unbiased look-ups cost less; gradients walk every cell")
+    return Choice(subject, "estimated", f"{size}: unbiased look-ups cost less; {gradients}")
 
 
 def choose_side_flights(needs: Needs, settings: Settings, segment: str) -> tuple[float | None, list[Choice]]:

@@ -63,7 +63,7 @@ from mivol.scene.scene_state import SceneState, find_gradient_array
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.stand_in import StandIn, evaluate_samplers, reset_sampler
 from mivol.scene.survey import SceneSurvey, survey_scene
-from mivol.scene_graph import list_values, put_value, traverse, traverse_children
+from mivol.scene_graph import find_children, list_values, put_value, traverse, traverse_children
 from mivol.transport.estimators.lighting.bright_map import BrightMap, MapReading
 from mivol.transport.estimators.lighting.emitters import read_emitters
 from mivol.transport.estimators.scores import Primal
@@ -113,9 +113,12 @@ class _SurveyedScene:
 
     def find_grids(self) -> StockGrids:
         """What is known of the stock grids of the scene, with their look-ups."""
+        grids = self.survey.grids
         for boundary in self.survey.boundaries:
-            boundary.view(self.survey.grids)
-        return self.survey.grids
+            parts = [child for name, child in find_children(boundary.medium).items() if name.startswith("sigma_")]
+            if any(grids.is_unknown(part) for part in parts):
+                boundary.view(grids)
+        return grids
 
     def is_of(self, parts: list[mi.Object]) -> bool:
         """Whether ``parts`` are the very same shapes and emitters."""

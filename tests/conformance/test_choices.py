@@ -127,6 +127,24 @@ def test_shadows(medium: MediumFacts, emitters: tuple, settings: Settings, choic
     assert choices.choose_shadows(medium, needs(medium, emitters=emitters), settings).choice == choice
 
 
+@pytest.mark.parametrize(
+    ("cell_depth", "emitters", "settings", "looked_up"),
+    [
+        (0.37, ("area",), Settings(max_depth=3), True),
+        (0.38, ("area",), Settings(max_depth=3), False),
+        (None, ("area",), Settings(max_depth=3), False),
+        (0.37, ("area",), LIT, False),
+        (0.37, ("uniform",), Settings(max_depth=3), False),
+    ],
+)
+def test_shadows_of_gradients(cell_depth: float | None, emitters: tuple, settings: Settings, looked_up: bool) -> None:
+    """In thin grids look-ups take the place of walks: up to 1.5 faces for 2 look-ups that cost 2 faces each."""
+    for resolution in (20, 300):
+        medium = fog(resolutions=((resolution,) * 3,), cell_depth=cell_depth)
+        found = choices.choose_shadows(medium, needs(medium, emitters=emitters), settings)
+        assert ("gradients take a few look-ups" in found.reason) == looked_up
+
+
 def test_shadows_are_no_question_without_a_grid_or_light():
     for medium, settings in (
         (fog(resolutions=()), LIT),

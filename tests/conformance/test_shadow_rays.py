@@ -12,6 +12,7 @@ from scattering_scenes import PLACE, close_up, point
 from volpath_scenes import EMITTERS, RED, area, behind_a_mask, cube, grid_in, same, square
 
 from mivol.transport.estimators.lighting.shadow_rays import (
+    FACES_ON_EDGE,
     LOOKUPS,
     ROULETTE_TAU,
     STEPS_PER_LOOKUP,
@@ -105,7 +106,7 @@ def test_a_ray_that_ends_is_walked_no_further():
 # -- Look-ups in thin grids ------------------------------------------------------------------------------------------------
 
 CELLS = 24
-THINNEST = 1.5 * (CELLS / 2) / (LOOKUPS * STEPS_PER_LOOKUP)
+THINNEST = FACES_ON_EDGE * (CELLS / 2) / (LOOKUPS * STEPS_PER_LOOKUP)
 """Extinction [1/length] below which look-ups cost less than a walk of a grid of ``CELLS`` cells of length 2 / ``CELLS``."""
 
 

@@ -60,6 +60,10 @@ class StockGrids:
             self.trilinear[volume.ptr] = answer
         return self.trilinear.get(volume.ptr, True)
 
+    def is_unknown(self, child: mi.Object) -> bool:
+        """Whether a part of a medium is a stock grid whose look-ups were not compared yet."""
+        return isinstance(child, mi.Volume) and child.class_name() == "GridVolume" and child.ptr not in self.trilinear
+
     def is_called(self, volume: mi.Volume) -> bool:
         """Whether transport calls a volume at points, as far as its look-ups are known; it reads the values of others."""
         is_read = volume.class_name() in ("GridVolume", "ConstVolume") or hasattr(volume, "mivol_to_world")

@@ -135,6 +135,9 @@ lamps inside, over 2: with 4 0.98 times the variance in 1.04 times the time.)"""
 STEPS_PER_LOOKUP = 2.0
 """Time of a look-up at a random point over that of a step from cell to cell [1]. Lanes differ more in their look-ups."""
 
+FACES_ON_EDGE = 1.5
+"""Faces that a walk crosses on a way as long as the edge of a cell, on average over the directions [1]."""
+
 SHADOW_NUMBERS = 2
 """Number of the generator of a shadow ray's look-ups among the forks of its state."""
 
@@ -179,8 +182,7 @@ class _SparseTransmittance:
         scale = dr.detach(body.view.scale) * body.area(interval.ray.d)
         for part in grids:
             segment, rate = clip_interval(part.lattice, interval), LOOKUPS * scale * part.largest
-            # A walk crosses 3 / 2 faces on a way as long as a cell's edge, on average over the directions.
-            is_thin = self.looks_up & (STEPS_PER_LOOKUP * rate < 1.5 * dr.norm(segment.d))
+            is_thin = self.looks_up & (STEPS_PER_LOOKUP * rate < FACES_ON_EDGE * dr.norm(segment.d))
             lanes = interval.active & is_thin & (rate > 0)
             own, rng = ratio_tracking_in_grid(part.lattice, segment, scale, dr.select(lanes, rate, 1), rng, lanes)
             T = [a * b for a, b in zip(T, to_scene_channels(own, channels), strict=True)]
