@@ -345,4 +345,7 @@ def _part(
 
 def _tensor(values: mi.TensorXf) -> mi.TensorXf:
     """Grid values as (Z, Y, X, C), or (bricks, 8, 8, 8, C)."""
+    if values.array.state == dr.VarState.Literal:
+        # Look-ups in an empty grid of one literal would leave the state of a loop unchanged, and Dr.Jit 1.5 then raises.
+        dr.make_opaque(values)
     return values if len(values.shape) >= 4 else mi.TensorXf(values.array, (*values.shape, 1))
