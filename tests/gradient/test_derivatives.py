@@ -118,7 +118,8 @@ def replays(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, np.ndarray, np.n
 def test_a_replay_finds_the_light_that_was_found(name: str, replays: list) -> None:
     """Replayed branches, in another order, leave only rounding; replayed stems leave the mean light of their branches."""
     gradient_of_mean_image(SCENES[name](), KEYS["density"], 16, fresh(3), depth=7)
-    (first, whole, left, dL), (second, light, rest, scaled) = replays
+    # An attempt to record may have run up to its end before it is given up.
+    (first, whole, left, dL), (second, light, rest, scaled) = replays[-2:]
     assert (first, second) == ("stems", "branches")
     assert len(np.unique(light[0])) > 100
     # Some 20 terms of a path are subtracted one by one.

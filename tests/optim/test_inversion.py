@@ -101,8 +101,8 @@ def drifting(scan):
 NO_LIGHT = LightDrift(np.zeros(1), np.zeros(1))
 
 
-def states_of(problem, n, state=None):
-    return list(itertools.islice(solve_with_light(SOLVERS["pcg"].run, problem, DriftFit(TIMES), 5, state), n))
+def states_of(problem, n, state=None, solver="pcg"):
+    return list(itertools.islice(solve_with_light(SOLVERS[solver].run, problem, DriftFit(TIMES), 5, state), n))
 
 
 def test_turn_alternates_solver_and_drift(drifting):
@@ -115,6 +115,18 @@ def test_turn_alternates_solver_and_drift(drifting):
     drift = update_light(problem, DriftFit(TIMES), NO_LIGHT, own[4].x)
     target = LeastSquares(problem.A, problem.b - drift.eval(TIMES), problem.weights, own[4].x, nonnegative=True)
     np.testing.assert_array_equal(states[6].x, list(itertools.islice(SOLVERS["pcg"].run(target), 2))[-1].x)
+
+
+@pytest.mark.parametrize("solver", ["pcg", "sirt"])
+def test_a_resumed_run_knows_the_light(drifting, solver):
+    """It goes on from the middle of a turn, with the light that was fitted before, to the last bit."""
+    problem, _ = drifting
+    states = states_of(problem, 12, solver=solver)
+    resumed = states_of(problem, 5, SolverState.from_arrays(states[6].to_arrays()), solver)
+    assert states[6].memory["offset"].any()
+    for one, other in zip(states[7:], resumed, strict=True):
+        assert (one.iteration, one.residual_norm) == (other.iteration, other.residual_norm)
+        np.testing.assert_array_equal(one.x, other.x)
 
 
 def test_without_drift_the_solver_goes_on(scan):
