@@ -181,6 +181,20 @@ def test_listed_probes_have_the_baseline_of_their_flights(monkeypatch: pytest.Mo
     np.testing.assert_allclose(*found, rtol=1e-4)
 
 
+@pytest.mark.parametrize("lamp", ["sun", "inside"])
+def test_a_fit_may_start_from_an_empty_grid_of_one_literal(lamp: str) -> None:
+    """The derivatives are those by zeros in memory."""
+    found = []
+    for zeros in (lambda shape: mi.TensorXf(np.zeros(shape, np.float32)), lambda shape: dr.zeros(mi.TensorXf, shape)):
+        scene = smoky() if lamp == "sun" else lit_inside(BULB)
+        params = mi.traverse(scene)
+        params[KEYS["density"]] = zeros(params[KEYS["density"]].shape)
+        params.update()
+        found.append(gradient_of_mean_image(scene, KEYS["density"], 4, 3))
+    np.testing.assert_allclose(*found, rtol=1e-5, atol=1e-6 * np.abs(found[0]).max())
+    assert np.abs(found[0]).max() > 0
+
+
 def lit_inside(lamp: dict, rgb: bool = False) -> mi.Scene:
     """A lamp inside of smoke: segments draw its light."""
     values = 0.5 + rough_grid(4, 3.0)
