@@ -325,8 +325,10 @@ class NearLighting:
         # -- The distance ------------------------------------------------------------------------------------------------
         chosen = self.emitters.choose_emitter(ray, samples.which_emitter)
         passed = RaySegment(ray, segment.medium, length)
-        draw = self._draw_point if self.draws_points else self._draw_in_cells
-        event, reach, is_exact, rng = draw(passed, chosen, samples, rng, looks_up, on)
+        if self.draws_points:
+            event, reach, is_exact, rng = self._draw_point(passed, chosen, rng, on)
+        else:
+            event, reach, is_exact, rng = self._draw_in_cells(passed, chosen, samples.inside, rng, looks_up, on)
         if known is not None:
             place, is_known = known
             event.t, event.body = dr.select(is_known, place.t, event.t), dr.select(is_known, place.body, event.body)
@@ -354,7 +356,7 @@ class NearLighting:
         self,
         passed: RaySegment,
         chosen: ChosenEmitter,
-        samples: NearLightSamples,
+        u: mi.Point2f,
         rng: mi.UInt32,
         looks_up: mi.Bool | None,
         active: mi.Bool,
@@ -368,7 +370,7 @@ class NearLighting:
         proposal = DistanceProposal(self.media, passed.ray, chosen, None, self.probe_depth, is_rough=True)
         reservoir = refill_reservoir(proposal, passed, start_reservoir(self.media, [rng]), active)
         (candidate,) = reservoir.candidates
-        event = sample_distance(proposal, candidate, reservoir.total, samples.inside, active)
+        event = sample_distance(proposal, candidate, reservoir.total, u, active)
         T = transmittance(event.tau)
         if not proposal.is_exact:
             before = RaySegment.upto(passed.ray, passed.medium, event.t)
@@ -376,13 +378,7 @@ class NearLighting:
         return event, dr.select(event.on, T / event.pdf, 0), proposal.is_exact, candidate.rng
 
     def _draw_point(
-        self,
-        passed: RaySegment,
-        chosen: ChosenEmitter,
-        samples: NearLightSamples,
-        rng: mi.UInt32,
-        looks_up: mi.Bool | None,
-        active: mi.Bool,
+        self, passed: RaySegment, chosen: ChosenEmitter, rng: mi.UInt32, active: mi.Bool
     ) -> tuple[MediumEvent, mi.Spectrum, bool, mi.UInt32]:
         """The same by look-ups in a thin grid; the extinction is that of a corner of the cell."""
         point = draw_near_point(self.media, passed, chosen.equiangular, self.probe_depth, rng, active)
