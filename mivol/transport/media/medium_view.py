@@ -31,7 +31,7 @@ from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridExtinction
 from mivol.transport.media.octree_extinction import LeafField, OctreeExtinction
 from mivol.transport.media.phases import HenyeyGreenstein, Isotropic, Microflakes, Phase, PluginPhase, read_phase
-from mivol.transport.media.stock_grids import StockGrids
+from mivol.transport.media.stock_grids import StockGrids, holds_values
 from mivol.transport.traversal.box import Box, opaque_numbers
 from mivol.transport.traversal.lattice import Lattice
 
@@ -324,7 +324,7 @@ def _part(
     if hasattr(volume, "mivol_extinction"):
         return _field_part(name, volume.mivol_extinction, scale)
     is_stock = volume.class_name() == "GridVolume"
-    if not (is_stock or volume.class_name() == "ConstVolume" or hasattr(volume, "mivol_to_world")):
+    if not holds_values(volume):
         return _field_part(name, PluginField(volume), scale)
     grid, constant = f"{name}.data", f"{name}.value.value"
     if grid in params.properties:

@@ -66,8 +66,12 @@ class StockGrids:
 
     def is_called(self, volume: mi.Volume) -> bool:
         """Whether transport calls a volume at points, as far as its look-ups are known; it reads the values of others."""
-        is_read = volume.class_name() in ("GridVolume", "ConstVolume") or hasattr(volume, "mivol_to_world")
-        return not is_read or not self.trilinear.get(volume.ptr, True)
+        return not holds_values(volume) or not self.trilinear.get(volume.ptr, True)
+
+
+def holds_values(volume: mi.Volume) -> bool:
+    """Whether a volume is a grid or a constant of Mitsuba, or a grid of mivol, so that its values may be read."""
+    return volume.class_name() in ("GridVolume", "ConstVolume") or hasattr(volume, "mivol_to_world")
 
 
 def compare_look_up(volume: mi.Volume, lattice: Lattice) -> bool | None:

@@ -510,15 +510,15 @@ def _find_first_collision(
             ahead = RayInterval(ray, t0, t1, interval.active & (t1 > t0))
             if known is not None:
                 ahead.active &= ~known.on
+            found: list[mi.Float] = []
             if not part.exact_line:
                 hit, found, rng = delta_tracking(part, scale, ahead, channel, rng)
             elif isinstance(part, GaussianExtinction):
                 hit, rng = sample_gaussian_flight(part, scale, ahead, rng)
-                found = []
             elif isinstance(part, OctreeExtinction):
                 hit = part.find_collision(scale, ahead, -dr.log(1 - u), channel)
                 rng, (other,) = draw_pcg32(rng, 1)
-                u, found = dr.select(ahead.active, other, u), []
+                u = dr.select(ahead.active, other, u)
             else:
                 if _tracks_grid(part) and not inverts:
                     hit, found, rng = delta_tracking_in_blocks(part, scale, ahead, channel, u, rng)

@@ -43,7 +43,8 @@ __all__ = [
     "ratio_tracking_in_grid",
     "delta_tracking_in_blocks",
     "delta_tracking",
-    "make_node_finder",
+    "make_look_up",
+    "roulette_lift",
 ]
 
 
@@ -129,9 +130,7 @@ def residual_ratio_tracking(
         fresh = -dr.log(u[3])
         ahead = dr.select(meets, fresh, dr.maximum(state.ahead - dr.select(on, density * dt, 0), 0))
         # -- Roulette ---------------------------------------------------------------------------------------------------
-        largest = maximum([w * dr.exp(-t) for w, t in zip(weight, tau, strict=True)])
-        survives = u[4] * ROULETTE_BELOW < largest
-        lift = dr.select(survives, dr.maximum(1, ROULETTE_BELOW / largest), 0)
+        lift = roulette_lift([w * dr.exp(-t) for w, t in zip(weight, tau, strict=True)], u[4])
         weight = [dr.select(on, w * lift, w) for w in weight]
         return _TrackedRay(tau, weight, ahead, rng), dt
 
@@ -150,6 +149,13 @@ def residual_ratio_tracking(
     return [w * dr.exp(-t) for t, w in zip(end.tau, end.weight, strict=True)], end.rng
 
 
+def roulette_lift(estimates: list[mi.Float], chance: mi.Float) -> mi.Float:
+    """The factor on the estimates of a ray [1] by Russian roulette below ``ROULETTE_BELOW``: 0 if the ray ends; ``chance`` is
+    uniform in [0, 1)."""
+    largest = maximum(estimates)
+    return dr.select(chance * ROULETTE_BELOW < largest, dr.maximum(1, ROULETTE_BELOW / largest), 0)
+
+
 def _make_corner_sampler(
     lattice: Lattice, segment: Segment
 ) -> Callable[[Cell, mi.Float, list[mi.Float], mi.Bool], tuple[mi.UInt32, mi.Bool]]:
@@ -159,7 +165,7 @@ def _make_corner_sampler(
     Each corner has its trilinear weight as probability, by three uniform random numbers; the result is the index of its node,
     and the lanes in which it is stored.
     """
-    shift, find_node = lattice.block_ranges.shift, make_node_finder(lattice)
+    shift, find_node = lattice.block_ranges.shift, _make_node_finder(lattice)
     is_ascending, speed = segment.d > 0, dr.abs(segment.d) * 2.0**-shift
 
     def draw_corner(cell: Cell, dt: mi.Float, u: list[mi.Float], active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
@@ -171,7 +177,7 @@ def _make_corner_sampler(
     return draw_corner
 
 
-def make_node_finder(lattice: Lattice) -> Callable[[mi.Vector3i, mi.Bool], tuple[mi.UInt32, mi.Bool]]:
+def _make_node_finder(lattice: Lattice) -> Callable[[mi.Vector3i, mi.Bool], tuple[mi.UInt32, mi.Bool]]:
     """Make ``find_node(node, active)``: the index of a node, clamped to the grid, and the lanes in which it is stored."""
     res, bricks = lattice.res, lattice.bricks
 
@@ -182,6 +188,21 @@ def make_node_finder(lattice: Lattice) -> Callable[[mi.Vector3i, mi.Bool], tuple
         return mi.UInt32((node.z * res[1] + node.y) * res[2] + node.x), active
 
     return find_node
+
+
+def make_look_up(lattice: Lattice, segment: Segment) -> Callable[[mi.Float, list[mi.Float], mi.Bool], list[mi.Float]]:
+    """Make ``look_up(s, u, active)``: each channel of one corner of the cell at the distance ``s`` from the start of a segment.
+
+    Each corner has its trilinear weight as probability, by the first three of the uniform random numbers ``u``.
+    """
+    find_node, values, channels = _make_node_finder(lattice), dr.detach(lattice.values.array), lattice.channels
+    entry, d = mi.Vector3f(segment.cell) + segment.frac, segment.d
+
+    def look_up(s: mi.Float, u: list[mi.Float], active: mi.Bool) -> list[mi.Float]:
+        node, stored = find_node(mi.Vector3i(dr.floor(dr.fma(d, s, entry) + mi.Vector3f(*u[:3]))), active)
+        return [dr.gather(mi.Float, values, node * channels + c, stored) for c in range(channels)]
+
+    return look_up
 
 
 def block_segment(segment: Segment, shift: int) -> Segment:
@@ -223,8 +244,7 @@ def ratio_tracking(
         values = part.eval_at(scale, ray, t, on)
         T = [dr.select(on, a * (1 - value / rate), a) for a, value in zip(T, values, strict=True)]
         # -- Roulette ---------------------------------------------------------------------------------------------------
-        largest = maximum(T)
-        lift = dr.select(chance * ROULETTE_BELOW < largest, dr.maximum(1, ROULETTE_BELOW / largest), 0)
+        lift = roulette_lift(T, chance)
         T = [dr.select(on, a * lift, a) for a in T]
         return t, T, rng, on & (lift > 0)
 
@@ -254,18 +274,13 @@ def ratio_tracking_in_grid(
     Bias: none. Variance: T^2 (exp(int E(c^2) / rate dt) - 1) with the drawn corner c, at most T^2 (exp(tau k) - 1) if the
     largest extinction is k times the rate. Cost: ``rate`` times the length look-ups of one node each.
     """
-    values, length, pace, channels = dr.detach(lattice.values.array), segment.length, dr.rcp(rate), lattice.channels
-    find_node = make_node_finder(lattice)
-    entry, d = mi.Vector3f(segment.cell) + segment.frac, segment.d
+    length, pace, look_up, channels = segment.length, dr.rcp(rate), make_look_up(lattice, segment), lattice.channels
 
     def step(s: mi.Float, T: list[mi.Float], rng: mi.UInt32, on: mi.Bool) -> tuple:
         rng, u = draw_pcg32(rng, 4)
         s = dr.fma(-dr.log(u[3]), pace, s)
         on &= s < length
-        # Each corner of the cell has its trilinear weight as probability.
-        corner = mi.Vector3i(dr.floor(dr.fma(d, s, entry) + mi.Vector3f(*u[:3])))
-        node, stored = find_node(corner, on)
-        row = [dr.gather(mi.Float, values, node * channels + c, stored) for c in range(channels)]
+        row = look_up(s, u, on)
         return s, [dr.select(on, t * dr.fma(-scale * pace, v, 1), t) for t, v in zip(T, row, strict=True)], rng, on
 
     width = dr.width(length)

@@ -596,5 +596,8 @@ class EquiangularSampler:
 
     def density(self, a: mi.Float, dt: mi.Float, t: mi.Float) -> mi.Float:
         """Density of :meth:`sample` at the distance ``t`` from ``a`` [1/length]."""
-        r2 = dr.square(self.rho) + dr.square((a - self.t0) + t)
-        return self.rho * dr.rcp(r2 * self.angle(a, dt))
+        return self.rho * dr.rcp(self.squared_distance(a, t) * self.angle(a, dt))
+
+    def squared_distance(self, a: mi.Float, t: mi.Float) -> mi.Float:
+        """Squared distance to the emitter at the distance ``t`` from ``a`` [length^2]."""
+        return dr.square(self.rho) + dr.square((a - self.t0) + t)

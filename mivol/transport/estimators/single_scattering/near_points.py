@@ -21,18 +21,17 @@ of eight); Kulla & Fajardo 2012 (the angle); Talbot et al. 2005 (one of several 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
-from mivol.numerics import fast_min, maximum
-from mivol.transport.estimators.flights.tracking import ROULETTE_BELOW, make_node_finder
+from mivol.numerics import fast_min
+from mivol.transport.estimators.flights.tracking import make_look_up, roulette_lift
 from mivol.transport.estimators.lighting.emitters import EquiangularSampler
 from mivol.transport.estimators.single_scattering.distance_sampling import bounded_inverse
 from mivol.transport.media.extinction import to_spectrum
-from mivol.transport.media.grid_extinction import GridExtinction, clip_interval
+from mivol.transport.media.grid_extinction import clip_interval
 from mivol.transport.media.ray_intervals import MediumInterval, RaySegment, revisit_media
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.random_numbers import draw_pcg32
@@ -130,12 +129,16 @@ def _pass_points(
 ) -> _Points:
     """Pass the points of an interval of the medium."""
     (part,) = interval.body.view.parts
-    segment, look_up = clip_interval(part.lattice, interval), _make_look_up(media, part)
-    entry, d, length = mi.Vector3f(segment.cell) + segment.frac, segment.d, segment.length
+    segment = clip_interval(part.lattice, interval)
+    begin, length, look_up = segment.t0, segment.length, make_look_up(part.lattice, segment)
     scale = dr.detach(interval.body.view.scale) * interval.body.area(interval.ray.d)
     rate = (RATE_IN_DERIVATIVES if probe_depth else RATE_IN_IMAGES) * scale * part.largest
     pace, kappa = bounded_inverse(rate), probe_depth * bounded_inverse(length)
-    angles = _Angles(equiangular, segment.t0, length)
+
+    def sample_angle(number: mi.UInt32, u: mi.Float) -> mi.Float:
+        """A distance in a part of the angle [length]; infinite behind the last part."""
+        s = equiangular.sample(begin, length, (mi.Float(number) + u) * (1 / ANGLES))
+        return dr.select(number < ANGLES, s, dr.inf)
 
     def step(
         ahead: mi.Float, aside: mi.Float, number: mi.UInt32, s: mi.Float, keeps: mi.Bool, points: _Points, on: mi.Bool
@@ -146,11 +149,10 @@ def _pass_points(
         here = fast_min(ahead, aside)
         on &= here < length
         here = dr.select(on, here, 0)
-        row = look_up(mi.Vector3i(dr.floor(dr.fma(d, here, entry) + mi.Vector3f(*u[:3]))), on)
-        sigma_t = [scale * value for value in row]
+        sigma_t = media.to_channels([scale * value for value in look_up(here, u, on)])
         # -- Offer it ---------------------------------------------------------------------------------------------------
-        r2 = angles.squared_distance(here)
-        spacing = dr.rcp(rate + angles.density(r2))
+        r2 = equiangular.squared_distance(begin, here)
+        spacing = dr.rcp(rate + ANGLES * equiangular.density(begin, length, here))
         seen = sum((T * (sigma + kappa) for T, sigma in zip(points.T, sigma_t, strict=True)), mi.Float(0))
         weight = seen * spacing * dr.rcp(r2)
         # Where the emitter touches the ray, the angle may have no length.
@@ -163,56 +165,21 @@ def _pass_points(
         # -- The transmittance behind it, with roulette -----------------------------------------------------------------
         dims = on & ~by_angle
         T = [dr.select(dims, T * dr.fma(-pace, sigma, 1), T) for T, sigma in zip(points.T, sigma_t, strict=True)]
-        largest = maximum(T)
-        lift = dr.select(u[4] * ROULETTE_BELOW < largest, dr.maximum(1, ROULETTE_BELOW / largest), 0)
+        lift = roulette_lift(T, u[4])
         T = [dr.select(dims, T * lift, T) for T in T]
         on &= ~dims | (lift > 0)
         points = _Points(T, total, points.t, reach, found, rng)
         # -- The point behind it ----------------------------------------------------------------------------------------
         number = dr.select(by_angle, number + 1, number)
         ahead = dr.select(by_angle, ahead, dr.fma(-dr.log(u[5]), pace, ahead))
-        aside = dr.select(by_angle, angles.sample(number, u[6]), aside)
+        aside = dr.select(by_angle, sample_angle(number, u[6]), aside)
         return ahead, aside, number, dr.select(keep, here, s), keeps | keep, points, on
 
     rng, u = draw_pcg32(points.rng, 2)
     first, zero = dr.zeros(mi.UInt32, dr.width(length)), dr.zeros(mi.Float, dr.width(length))
     points.rng = rng
     on = interval.active & (length > 0)
-    start = -dr.log(u[0]) * pace, angles.sample(first, u[1]), first, zero, mi.Bool(zero > 0), points, on
+    start = -dr.log(u[0]) * pace, sample_angle(first, u[1]), first, zero, mi.Bool(zero > 0), points, on
     *_, s, keeps, points, _ = dr.while_loop(start, lambda *state: state[-1], step, label="points of near light")
     points.t = dr.select(keeps, segment.start + mi.Float64(s), points.t)
     return points
-
-
-def _make_look_up(media: SceneMedia, part: GridExtinction) -> Callable[[mi.Vector3i, mi.Bool], list[mi.Float]]:
-    """Make ``look_up(node, active)``: the value of a grid at a node, for each channel of the scene."""
-    find_node, values, channels = make_node_finder(part.lattice), dr.detach(part.values), part.channels
-
-    def look_up(node: mi.Vector3i, active: mi.Bool) -> list[mi.Float]:
-        index, stored = find_node(node, active)
-        return media.to_channels([dr.gather(mi.Float, values, index * channels + c, stored) for c in range(channels)])
-
-    return look_up
-
-
-class _Angles:
-    """Equal parts of the angle that an interval [begin, begin + length] of a ray has, seen from an emitter."""
-
-    def __init__(self, equiangular: EquiangularSampler, begin: mi.Float, length: mi.Float) -> None:
-        self._rho, self._begin, self._length = equiangular.rho, begin - equiangular.t0, length
-        self._part = equiangular.angle(begin, length) * (1 / ANGLES)
-        self._entry = self._begin / self._rho
-
-    def sample(self, part: mi.UInt32, u: mi.Float) -> mi.Float:
-        """A distance from the begin of the interval in one part of the angle [length]; infinite behind the last part."""
-        sin, cos = dr.sincos((mi.Float(part) + u) * self._part)
-        s = self._rho * sin * dr.fma(self._entry, self._entry, 1) / dr.fma(-self._entry, sin, cos)
-        return dr.select(part < ANGLES, dr.clip(s, 0, self._length), dr.inf)
-
-    def squared_distance(self, s: mi.Float) -> mi.Float:
-        """Squared distance to the emitter, at the distance ``s`` from the begin [length^2]."""
-        return dr.square(self._rho) + dr.square(self._begin + s)
-
-    def density(self, squared_distance: mi.Float) -> mi.Float:
-        """Mean number of points for each length at this squared distance from the emitter [1/length]."""
-        return self._rho * dr.rcp(squared_distance * self._part)
